@@ -1,0 +1,2 @@
+//! Hardware-free firmware logic of the stspp sensor.
+#![no_std]

@@ -1,0 +1,8 @@
+//! Hardware-in-the-loop simulator of the stspp sensor.
+//!
+//! [`world`] is what light does: scene, projectors, cameras, noise. [`device`] is what the sensor's
+//! controller does: protocol in, pin edges out. A camera joins them: it integrates the light over the
+//! gate waveform that the controller produced.
+
+pub mod device;
+pub mod world;

@@ -1,0 +1,1 @@
+//! Light: scene, projectors, cameras, noise, ground truth.

@@ -1,0 +1,3 @@
+//! The `stspp` command line.
+
+fn main() {}

@@ -1,0 +1,1 @@
+//! Driver of the stspp 3D sensor.

@@ -1,0 +1,26 @@
+//! The matcher's output.
+
+use crate::Image;
+
+/// Wall and CPU time of one stage of the last frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StageTime {
+    /// The stage, as its file is named.
+    pub stage: &'static str,
+    /// Wall time in milliseconds.
+    pub wall_ms: f64,
+}
+
+/// Disparity and similarity of one stereo stack, on the left rectified canvas.
+#[derive(Debug, Clone)]
+pub struct Matched {
+    /// Disparity x_left - x_right in pixels; NaN is invalid. Refers to the newest frame's time where
+    /// motion is estimated.
+    pub disparity_px: Image<f32>,
+    /// ZNCC = 1 - ZNSSD / 2 of the refined subset, -1..=1; NaN where the disparity is.
+    pub zncc: Image<f32>,
+    /// Disparity's rate in px per second where motion is estimated, NaN where invalid.
+    pub rate_px_per_s: Option<Image<f32>>,
+    /// Time of each stage, in order.
+    pub stages: Vec<StageTime>,
+}

@@ -1,0 +1,2 @@
+//! Messages between the stspp sensor and its host.
+#![no_std]
