@@ -1,5 +1,45 @@
 //! Build and test tasks: `cargo xtask help`.
 
-fn main() {
-    println!("cargo xtask test");
+mod arrows;
+mod debian;
+mod licences;
+mod stage;
+mod test;
+mod workspace;
+
+use std::process::ExitCode;
+
+const HELP: &str = "\
+cargo xtask test [--quick]   everything that is proven: formatting, lints, dependency arrows,
+                             licences, tests. --quick leaves out the stages that need Debian packages
+cargo xtask arrows           check which crate may depend on which
+cargo xtask licences         check the licences of everything that ships against deny.toml
+cargo xtask help             this text";
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let outcome = match arguments.as_slice() {
+        ["test"] => return test::run(test::Depth::Full),
+        ["test", "--quick"] => return test::run(test::Depth::Quick),
+        ["arrows"] => workspace::metadata().and_then(|m| arrows::check(&m)),
+        ["licences"] => workspace::metadata().and_then(|m| licences::check(&m)),
+        ["help" | "--help" | "-h"] | [] => {
+            println!("{HELP}");
+            Ok(String::new())
+        }
+        other => Err(format!("unknown task `{}`\n\n{HELP}", other.join(" "))),
+    };
+    match outcome {
+        Ok(said) => {
+            if !said.is_empty() {
+                println!("{said}");
+            }
+            ExitCode::SUCCESS
+        }
+        Err(why) => {
+            eprintln!("xtask: {why}");
+            ExitCode::from(2)
+        }
+    }
 }

@@ -1,0 +1,83 @@
+//! `cargo xtask test`: everything that is proven, in stages, each of which runs even when an earlier
+//! one failed, so that one run shows all that is wrong.
+
+use crate::stage::{self, Outcome, Stage};
+use crate::{arrows, debian, licences, workspace};
+use std::process::{Command, ExitCode};
+
+/// How much to test.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Depth {
+    /// Only what needs nothing but Rust and a C compiler.
+    Quick,
+    /// Also the stages that need Debian packages.
+    Full,
+}
+
+fn cargo(arguments: &[&str]) -> Command {
+    let mut command = workspace::cargo();
+    command.args(arguments);
+    command
+}
+
+/// Runs all stages and prints the closing table; fails when a stage did.
+pub fn run(depth: Depth) -> ExitCode {
+    let metadata = workspace::metadata();
+    let with_metadata = |check: fn(&serde_json::Value) -> Result<String, String>| {
+        stage::check(metadata.as_ref().map_err(String::clone).and_then(check))
+    };
+    let stages: Vec<Stage> = vec![
+        stage::run("formatting", || stage::command(cargo(&["fmt", "--all", "--check"]))),
+        stage::run("dependency arrows", || with_metadata(arrows::check)),
+        stage::run("licences", || with_metadata(licences::check)),
+        stage::run("lints", || {
+            stage::command(cargo(&[
+                "clippy",
+                "--locked",
+                "--workspace",
+                "--all-targets",
+                "--",
+                "-D",
+                "warnings",
+            ]))
+        }),
+        stage::run("documentation", || {
+            let mut doc = cargo(&["doc", "--locked", "--workspace", "--no-deps"]);
+            doc.env("RUSTDOCFLAGS", "-D warnings");
+            stage::command(doc)
+        }),
+        stage::run("memory of the kernels", || {
+            deeper(depth, &["valgrind"], || Outcome::Skipped("not written yet".into()))
+        }),
+        stage::run("tests", || {
+            stage::command(cargo(&["test", "--locked", "--workspace", "--no-fail-fast"]))
+        }),
+    ];
+    summarise(&stages)
+}
+
+/// Skips `work` in a quick run and where its Debian packages cannot be had.
+fn deeper(depth: Depth, packages: &[&str], work: impl FnOnce() -> Outcome) -> Outcome {
+    if depth == Depth::Quick {
+        return Outcome::Skipped("left out by --quick".into());
+    }
+    match debian::ensure(packages) {
+        Ok(()) => work(),
+        Err(why) => Outcome::Skipped(why),
+    }
+}
+
+fn summarise(stages: &[Stage]) -> ExitCode {
+    println!("\n=== summary");
+    for stage in stages {
+        println!("{}", stage::line(stage));
+    }
+    let count = |wanted: fn(&Outcome) -> bool| stages.iter().filter(|s| wanted(&s.outcome)).count();
+    let failed = count(|o| matches!(o, Outcome::Failed(_)));
+    println!(
+        "{} passed, {failed} failed, {} skipped",
+        count(|o| matches!(o, Outcome::Passed(_))),
+        count(|o| matches!(o, Outcome::Skipped(_))),
+    );
+    if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
