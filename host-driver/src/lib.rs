@@ -1,1 +1,16 @@
-//! Driver of the stspp 3D sensor.
+//! Driver of the stspp 3D sensor: calibration, rectification, depth frames, recordings and their
+//! files.
+//!
+//! Lengths are metres, the frame is the left camera's optical frame (+x right, +y down, +z forward,
+//! origin at the centre of the unrectified camera 0), transforms are named `a_from_b`, an invalid
+//! pixel is NaN.
+
+pub mod calibration;
+pub mod frame;
+pub mod geometry;
+pub mod raw;
+
+pub use calibration::{CameraIntrinsics, StereoCalibration};
+pub use frame::{DepthFrame, PointCloud, SlotLabel};
+pub use geometry::RectifiedGeometry;
+pub use raw::RawImage;

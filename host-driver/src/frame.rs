@@ -1,0 +1,120 @@
+//! What the sensor delivers: depth frames and point clouds.
+
+use std::sync::Arc;
+
+use nalgebra::Point3;
+use serde::{Deserialize, Serialize};
+use stspp_matcher::{Image, StageTime};
+
+use crate::RectifiedGeometry;
+
+/// What lit one camera frame and when, as reported by the controller.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SlotLabel {
+    /// Number of the camera trigger since the stream started.
+    pub sequence: u32,
+    /// Index of the slot in the projection timing.
+    pub slot: u16,
+    /// Projectors that were on: bit k is projector k.
+    pub projector_mask: u16,
+    /// Whether the floodlight was on.
+    pub floodlight: bool,
+    /// Start of the exposure in microseconds of the device's clock.
+    pub trigger_time_us: u64,
+    /// Exposure in microseconds.
+    pub exposure_us: u32,
+}
+
+impl SlotLabel {
+    /// Centre of the exposure in seconds of the device's clock.
+    pub fn exposure_centre_s(&self) -> f64 {
+        (self.trigger_time_us as f64 + 0.5 * f64::from(self.exposure_us)) * 1e-6
+    }
+}
+
+/// Depth of one window of stereo pairs, on the left rectified canvas.
+#[derive(Debug, Clone)]
+pub struct DepthFrame {
+    /// Number of this frame since the stream started.
+    pub sequence: u64,
+    /// Depth in metres: z in the left camera's own (unrectified) frame of the point seen at this
+    /// pixel of the left rectified canvas. NaN is invalid.
+    pub depth_m: Image<f32>,
+    /// Disparity x_left - x_right in pixels, NaN where the depth is.
+    pub disparity_px: Image<f32>,
+    /// ZNCC of the refined subset, NaN where the depth is.
+    pub zncc: Image<f32>,
+    /// Brightness of the left camera: mean of the window's frames, 255 is the camera's full scale.
+    pub intensity: Image<u8>,
+    /// Speed along depth in metres per second where motion is estimated, NaN where the depth is.
+    pub depth_rate_m_per_s: Option<Image<f32>>,
+    /// What lit the frames of the window, oldest first; empty when the source knows none.
+    pub labels: Vec<SlotLabel>,
+    /// Time that the depth refers to, in seconds of the device's clock: the newest frame's exposure
+    /// centre where motion is estimated, the window's mean otherwise. `None` without labels.
+    pub time_device_s: Option<f64>,
+    /// Host time of the newest frame's arrival; `None` for a frame that was never live.
+    pub arrived: Option<std::time::SystemTime>,
+    /// Geometry of the canvas.
+    pub geometry: Arc<RectifiedGeometry>,
+    /// Time of each stage.
+    pub stages: Vec<StageTime>,
+}
+
+impl DepthFrame {
+    /// Number of valid pixels.
+    pub fn valid_points(&self) -> usize {
+        self.depth_m.as_slice().iter().filter(|z| z.is_finite()).count()
+    }
+
+    /// All valid pixels as points of the left camera's frame, row by row.
+    pub fn point_cloud(&self) -> PointCloud {
+        let mut cloud = PointCloud::with_capacity(self.valid_points());
+        for y in 0..self.disparity_px.height() {
+            let (zncc, intensity) = (self.zncc.row(y), self.intensity.row(y));
+            for (x, &disparity_px) in self.disparity_px.row(y).iter().enumerate() {
+                if let Some(point) =
+                    self.geometry.point_left_m(x as f64, y as f64, f64::from(disparity_px))
+                {
+                    cloud.points_left_m.push(point.cast());
+                    cloud.zncc.push(zncc[x]);
+                    cloud.intensity.push(intensity[x]);
+                }
+            }
+        }
+        cloud
+    }
+}
+
+/// Points in the left camera's (unrectified) optical frame, metres.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PointCloud {
+    /// Positions: +x right, +y down, +z forward, metres.
+    pub points_left_m: Vec<Point3<f32>>,
+    /// ZNCC per point, as many as points.
+    pub zncc: Vec<f32>,
+    /// Brightness per point, as many as points.
+    pub intensity: Vec<u8>,
+}
+
+impl PointCloud {
+    /// An empty cloud with room for `points`.
+    pub fn with_capacity(points: usize) -> Self {
+        Self {
+            points_left_m: Vec::with_capacity(points),
+            zncc: Vec::with_capacity(points),
+            intensity: Vec::with_capacity(points),
+        }
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.points_left_m.len()
+    }
+
+    /// Whether there is no point.
+    pub fn is_empty(&self) -> bool {
+        self.points_left_m.is_empty()
+    }
+}
