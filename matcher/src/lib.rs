@@ -6,12 +6,17 @@
 
 pub mod error;
 pub mod image;
+pub mod level;
 pub mod matched;
+pub mod parallel;
 pub mod params;
+pub mod pipeline;
 pub mod stack;
 
 pub use error::Error;
 pub use image::Image;
+pub use level::Level;
 pub use matched::{Matched, StageTime};
-pub use params::{Advanced, DisparityRange, Method, Params, ShapeFunction};
+pub use params::{Advanced, DisparityRange, Interpolation, Method, Params, ShapeFunction};
+pub use pipeline::Matcher;
 pub use stack::{SAMPLES_PER_DN8, Sample, StereoStack};

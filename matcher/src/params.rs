@@ -1,5 +1,13 @@
 //! What a user can set: a few stable parameters, the rest under [`Advanced`].
 
+use crate::{Error, Level};
+
+/// Largest magnitude of a disparity, in pixels.
+pub const DISPARITY_LIMIT_PX: i32 = 16_384;
+
+/// Largest radius of a window, in pixels.
+pub const RADIUS_LIMIT: usize = 8;
+
 /// Candidate disparities, both ends included, in pixels of the rectified canvas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DisparityRange {
@@ -35,6 +43,17 @@ pub enum Method {
     Dense,
 }
 
+/// How grey values between the right images' pixels are found by IC-GN.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub enum Interpolation {
+    /// Cubic B-spline with prefilter: four taps.
+    Cubic,
+    /// Quintic B-spline with prefilter: six taps, about a fifth less noise than the cubic one.
+    #[default]
+    Quintic,
+}
+
 /// Parameters of a match.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Params {
@@ -68,6 +87,20 @@ pub struct Advanced {
     pub iterations_max: usize,
     /// Largest disagreement of left-right and right-left disparities.
     pub left_right_px: f32,
+    /// How much worse, as a part of all census bits, the best candidate more than two pixels away
+    /// must be than the winner.
+    pub uniqueness: f32,
+    /// Connected regions of fewer pixels are removed.
+    pub region_min: usize,
+    /// A window pixel belongs to the centre's surface when its coarse disparity is at most this far
+    /// from the local fit.
+    pub surface_px: f32,
+    /// Interpolation of the right images in IC-GN.
+    pub interpolation: Interpolation,
+    /// Highest SIMD level to use; the machine's best when `None`.
+    pub level_max: Option<Level>,
+    /// Threads of the matcher's own pool; rayon's process-wide pool when `None`.
+    pub threads: Option<usize>,
 }
 
 impl Default for Advanced {
@@ -80,6 +113,12 @@ impl Default for Advanced {
             convergence_px: 1e-3,
             iterations_max: 12,
             left_right_px: 1.5,
+            uniqueness: 0.02,
+            region_min: 60,
+            surface_px: 1.5,
+            interpolation: Interpolation::default(),
+            level_max: None,
+            threads: None,
         }
     }
 }
@@ -94,5 +133,39 @@ impl Params {
             zncc_min: 0.8,
             advanced: Advanced::default(),
         }
+    }
+
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] names the first field outside its range.
+    pub fn check(&self) -> Result<(), Error> {
+        fn within<T: PartialOrd + std::fmt::Display>(
+            name: &'static str,
+            value: T,
+            min: T,
+            max: T,
+        ) -> Result<(), Error> {
+            if value >= min && value <= max {
+                return Ok(());
+            }
+            let (got, allowed) = (value.to_string(), format!("{min} to {max}"));
+            Err(Error::Parameter { name, got, allowed })
+        }
+        let DisparityRange { min_px, max_px } = self.disparity;
+        within("disparity.min_px", min_px, -DISPARITY_LIMIT_PX, DISPARITY_LIMIT_PX)?;
+        within("disparity.max_px", max_px, min_px, DISPARITY_LIMIT_PX)?;
+        within("zncc_min", self.zncc_min, -1.0, 1.0)?;
+        let a = &self.advanced;
+        within("advanced.census_radius", a.census_radius, 1, RADIUS_LIMIT)?;
+        within("advanced.retry_radius", a.retry_radius, a.census_radius, RADIUS_LIMIT)?;
+        within("advanced.retry_similarity", a.retry_similarity, 0.0, 1.0)?;
+        within("advanced.subset_radius", a.subset_radius, 2, RADIUS_LIMIT)?;
+        within("advanced.convergence_px", a.convergence_px, 1e-9, 1.0)?;
+        within("advanced.iterations_max", a.iterations_max, 1, 1000)?;
+        within("advanced.left_right_px", a.left_right_px, 0.0, 1e6)?;
+        within("advanced.uniqueness", a.uniqueness, 0.0, 1.0)?;
+        within("advanced.surface_px", a.surface_px, 0.1, 1e6)?;
+        Ok(())
     }
 }

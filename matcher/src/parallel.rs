@@ -1,0 +1,101 @@
+//! Threads: a pool of the caller's or of our own, and loops over rows.
+//!
+//! Every loop hands each task its own rows to write, so results do not depend on the number of
+//! threads.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use crate::Error;
+
+/// Where parallel loops run: the process-wide rayon pool, or one of a fixed number of threads.
+#[derive(Debug, Clone, Default)]
+pub struct Pool(Option<Arc<rayon::ThreadPool>>);
+
+impl Pool {
+    /// A pool of `threads`; the process-wide one when `None`.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for zero threads, or when the system gives none.
+    pub fn new(threads: Option<usize>) -> Result<Self, Error> {
+        let Some(threads) = threads else { return Ok(Self(None)) };
+        let bad = |allowed: String| Error::Parameter {
+            name: "advanced.threads",
+            got: threads.to_string(),
+            allowed,
+        };
+        if !(1..=1024).contains(&threads) {
+            return Err(bad("1 to 1024".to_owned()));
+        }
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .thread_name(|i| format!("stspp-matcher-{i}"))
+            .build()
+            .map_err(|e| bad(format!("what the system can start ({e})")))?;
+        Ok(Self(Some(Arc::new(pool))))
+    }
+
+    /// Runs `work` inside the pool: parallel loops in it use the pool's threads.
+    pub fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        match &self.0 {
+            Some(pool) => pool.install(work),
+            None => work(),
+        }
+    }
+
+    /// Number of threads loops are spread over.
+    pub fn threads(&self) -> usize {
+        self.0.as_ref().map_or_else(rayon::current_num_threads, |p| p.current_num_threads())
+    }
+}
+
+/// Cuts `data` into bands of `rows` rows of `width` values (the last may be shorter) and calls
+/// `work(first_row, band)` for each, in parallel, with a scratch made once per thread's share.
+///
+/// Does nothing when `width` is zero.
+pub fn for_bands<T: Send, S: Send>(
+    data: &mut [T],
+    width: usize,
+    rows: usize,
+    scratch: impl Fn() -> S + Sync + Send,
+    work: impl Fn(&mut S, usize, &mut [T]) + Sync + Send,
+) {
+    if width == 0 {
+        return;
+    }
+    let rows = rows.max(1);
+    data.par_chunks_mut(width * rows)
+        .enumerate()
+        .for_each_init(scratch, |s, (band, chunk)| work(s, band * rows, chunk));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bands_cover_every_row_once() {
+        let mut data = vec![0u32; 7 * 23];
+        for_bands(
+            &mut data,
+            7,
+            4,
+            || (),
+            |(), y0, band| {
+                for (i, row) in band.chunks_mut(7).enumerate() {
+                    row.iter_mut().for_each(|v| *v += (y0 + i) as u32 + 1);
+                }
+            },
+        );
+        for (y, row) in data.chunks(7).enumerate() {
+            assert!(row.iter().all(|&v| v == y as u32 + 1));
+        }
+    }
+
+    #[test]
+    fn pool_has_the_threads_asked_for() {
+        assert_eq!(Pool::new(Some(3)).unwrap().threads(), 3);
+        assert!(Pool::new(Some(0)).is_err());
+    }
+}
