@@ -52,6 +52,11 @@ impl Level {
         Ok(Level::available().filter(|l| l.rank() <= rank).last().unwrap_or(Level::Scalar))
     }
 
+    /// This level, or the best one that this machine runs where it cannot run this one.
+    pub fn usable(self) -> Level {
+        if self.rank() <= Level::best().rank() && self.runs_here() { self } else { Level::best() }
+    }
+
     /// Name as [`LEVEL_VARIABLE`] takes it.
     pub fn name(self) -> &'static str {
         match self {

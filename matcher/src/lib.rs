@@ -4,14 +4,21 @@
 //! all, parabola, reliability retry, left-right check, sub-pixel refinement by Stereo-DIC, and comes
 //! out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
 
+pub mod census;
+pub mod check;
+pub mod cost;
 pub mod error;
 pub mod image;
 pub mod level;
 pub mod matched;
+pub mod parabola;
 pub mod parallel;
 pub mod params;
 pub mod pipeline;
+mod retry;
+pub mod search;
 pub mod stack;
+pub mod wta;
 
 pub use error::Error;
 pub use image::Image;

@@ -1,6 +1,14 @@
 //! The whole match, stage by stage.
 
-use crate::{Error, Level, Matched, Method, Params, StereoStack, parallel::Pool};
+use std::time::Instant;
+
+use crate::{
+    Error, Image, Level, Matched, Method, Params, StageTime, StereoStack,
+    census::PaddedStack,
+    check,
+    parallel::Pool,
+    search::{self, Coarse},
+};
 
 /// Matches stereo stacks; keeps its buffers between frames.
 ///
@@ -15,6 +23,8 @@ pub struct Matcher {
     params: Params,
     level: Level,
     pool: Pool,
+    left: PaddedStack,
+    right: PaddedStack,
 }
 
 impl Matcher {
@@ -26,7 +36,13 @@ impl Matcher {
         params.check()?;
         let level = Level::choose(params.advanced.level_max)?;
         let pool = Pool::new(params.advanced.threads)?;
-        Ok(Self { params, level, pool })
+        Ok(Self {
+            params,
+            level,
+            pool,
+            left: PaddedStack::default(),
+            right: PaddedStack::default(),
+        })
     }
 
     /// The parameters in use.
@@ -52,11 +68,57 @@ impl Matcher {
         stack.check()?;
         let pool = self.pool.clone();
         pool.install(|| match self.params.method {
-            Method::Parabola | Method::IcGn | Method::Dense => Err(Error::Parameter {
+            Method::Parabola => Ok(self.parabola(stack)),
+            Method::IcGn | Method::Dense => Err(Error::Parameter {
                 name: "method",
                 got: format!("{:?}", self.params.method),
-                allowed: "a method that is built in (none yet)".to_owned(),
+                allowed: "Parabola (the others are not built in)".to_owned(),
             }),
         })
+    }
+
+    /// The coarse search and its checks.
+    fn coarse(&mut self, stack: &StereoStack<'_>, clock: &mut Clock) -> Coarse {
+        self.left.fill(stack.left, stack.left_mask);
+        self.right.fill(stack.right, stack.right_mask);
+        clock.stage("pad");
+        let mut coarse = search::search(&self.left, &self.right, &self.params, self.level);
+        clock.stage("search");
+        let searched = coarse.disparity_px.clone();
+        check::median_3x3(&searched, &mut coarse.disparity_px);
+        check::remove_small_regions(&mut coarse.disparity_px, self.params.advanced.region_min);
+        clock.stage("check");
+        coarse
+    }
+
+    fn parabola(&mut self, stack: &StereoStack<'_>) -> Matched {
+        let mut clock = Clock::start();
+        let coarse = self.coarse(stack, &mut clock);
+        let zncc = Image::new(stack.width(), stack.height(), f32::NAN);
+        Matched {
+            disparity_px: coarse.disparity_px,
+            zncc,
+            rate_px_per_s: None,
+            stages: clock.stages,
+        }
+    }
+}
+
+/// Times the stages of a frame.
+struct Clock {
+    last: Instant,
+    stages: Vec<StageTime>,
+}
+
+impl Clock {
+    fn start() -> Self {
+        Self { last: Instant::now(), stages: Vec::new() }
+    }
+
+    fn stage(&mut self, stage: &'static str) {
+        let now = Instant::now();
+        let wall_ms = (now - self.last).as_secs_f64() * 1e3;
+        self.stages.push(StageTime { stage, wall_ms });
+        self.last = now;
     }
 }

@@ -10,6 +10,9 @@ pub type Sample = i16;
 /// Units of a [`Sample`] per grey level of an 8-bit image.
 pub const SAMPLES_PER_DN8: i16 = 64;
 
+/// Most columns of an image.
+pub const WIDTH_LIMIT: usize = 65_535;
+
 /// N rectified stereo pairs in slot order, all of one size.
 ///
 /// Rows correspond: a point at (x, y) on the left is at (x - disparity, y) on the right.
@@ -65,6 +68,13 @@ impl<'a> StereoStack<'a> {
         let size = (self.width(), self.height());
         if size.0 == 0 || size.1 == 0 {
             return shape("left stack", "images of at least one pixel".into(), format!("{size:?}"));
+        }
+        if size.0 > WIDTH_LIMIT {
+            return shape(
+                "left stack",
+                format!("at most {WIDTH_LIMIT} columns"),
+                size.0.to_string(),
+            );
         }
         for (what, images) in [("left stack", self.left), ("right stack", self.right)] {
             if let Some(i) = images.iter().find(|i| (i.width(), i.height()) != size) {
