@@ -6,6 +6,7 @@
 //! pixel is NaN.
 
 pub mod calibration;
+pub mod export;
 pub mod frame;
 pub mod geometry;
 pub mod raw;

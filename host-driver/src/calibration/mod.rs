@@ -1,19 +1,24 @@
 //! Calibration of the stereo rig: two distorted pinhole cameras and their relative pose.
+//!
+//! The product's format is Kalibr's `camchain.yaml` ([`kalibr`]); OpenCV's stereo YAML ([`opencv`])
+//! and pairs of ROS camera_info files ([`ros`]) are imported.
 
-use nalgebra::Isometry3;
+mod camera;
+mod error;
+pub mod kalibr;
+pub mod opencv;
+pub mod ros;
+mod yaml;
 
-/// A pinhole camera with radial-tangential distortion.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CameraIntrinsics {
-    /// Focal lengths [x, y] in pixels.
-    pub focal_px: [f64; 2],
-    /// Principal point [x, y] in pixels; the centre of the first pixel is (0, 0).
-    pub principal_px: [f64; 2],
-    /// Distortion coefficients [k1, k2, p1, p2] of the Brown model.
-    pub radtan: [f64; 4],
-    /// Image size [width, height] in pixels.
-    pub resolution_px: [usize; 2],
-}
+use std::path::Path;
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+
+pub use camera::CameraIntrinsics;
+pub use error::{CalibrationError, FieldError};
+
+/// Largest entry of R^T R - 1 that still counts as rounding of a printed rotation.
+const ROTATION_TOLERANCE: f64 = 2e-3;
 
 /// Calibration of the sensor.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,8 +36,103 @@ pub struct StereoCalibration {
 }
 
 impl StereoCalibration {
+    /// Reads a Kalibr `camchain.yaml` and checks that it is physically possible.
+    ///
+    /// # Errors
+    /// Names file, line, field and expectation.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self, CalibrationError> {
+        kalibr::read(path.as_ref())
+    }
+
+    /// Writes a Kalibr `camchain.yaml`; the file appears whole or not at all.
+    ///
+    /// # Errors
+    /// [`CalibrationError::Write`].
+    pub fn write(&self, path: impl AsRef<Path>) -> Result<(), CalibrationError> {
+        kalibr::write(self, path.as_ref())
+    }
+
     /// Distance of the camera centres in metres.
     pub fn baseline_m(&self) -> f64 {
         self.right_from_left.translation.vector.norm()
     }
+
+    /// Checks that a stereo rig can have these values, whatever file they came from.
+    ///
+    /// # Errors
+    /// The first field that is wrong, by its name in camchain.yaml.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        self.left.validate("cam0")?;
+        self.right.validate("cam1")?;
+        if self.left.resolution_px != self.right.resolution_px {
+            return Err(FieldError::new(
+                "cam1.resolution",
+                format!("cam0's, {:?}", self.left.resolution_px),
+                format!("{:?}", self.right.resolution_px),
+            ));
+        }
+        let translation_m = self.right_from_left.translation.vector;
+        let rotation = self.right_from_left.rotation.coords;
+        if translation_m.iter().chain(rotation.iter()).any(|v| !v.is_finite()) {
+            return Err(FieldError::new("cam1.T_cn_cnm1", "finite numbers", "NaN or infinity"));
+        }
+        let baseline_m = self.baseline_m();
+        if baseline_m < 1e-3 {
+            return Err(FieldError::new(
+                "cam1.T_cn_cnm1",
+                "a baseline of at least 0.001 m",
+                format!("{baseline_m} m"),
+            ));
+        }
+        if baseline_m > 10.0 {
+            return Err(FieldError::new(
+                "cam1.T_cn_cnm1",
+                "a translation in metres, at most 10 m",
+                format!("a baseline of {baseline_m} (millimetres?)"),
+            ));
+        }
+        let right_in_left_m = self.right_from_left.inverse().translation.vector;
+        if right_in_left_m.x < 0.5 * baseline_m {
+            return Err(FieldError::new(
+                "cam1.T_cn_cnm1",
+                "cam1 to the right of cam0 (a negative x translation; swap the cameras otherwise)",
+                format!("cam1 at {:?} m in cam0's frame", right_in_left_m.as_slice()),
+            ));
+        }
+        let axis_right = self.right_from_left.inverse_transform_vector(&Vector3::z());
+        if axis_right.z < 0.5 {
+            return Err(FieldError::new(
+                "cam1.T_cn_cnm1",
+                "optical axes within 60 degrees of each other",
+                format!("{:.1} degrees", axis_right.z.clamp(-1.0, 1.0).acos().to_degrees()),
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// The pose with the rotation nearest to `rotation`, which files print with few digits.
+fn isometry(
+    field: &str,
+    rotation: Matrix3<f64>,
+    translation_m: Vector3<f64>,
+) -> Result<Isometry3<f64>, FieldError> {
+    let deviation = (rotation.transpose() * rotation - Matrix3::identity()).abs().max();
+    let determinant = rotation.determinant();
+    if deviation.is_nan() || deviation > ROTATION_TOLERANCE || determinant <= 0.0 {
+        return Err(FieldError::new(
+            field,
+            "a rotation (orthonormal, determinant +1)",
+            format!("determinant {determinant:.4}, R^T R off the identity by {deviation:.2e}"),
+        ));
+    }
+    let svd = rotation.svd(true, true);
+    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else {
+        return Err(FieldError::new(field, "a rotation", "a matrix without decomposition"));
+    };
+    let rotation = Rotation3::from_matrix_unchecked(u * v_t);
+    Ok(Isometry3::from_parts(
+        Translation3::from(translation_m),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    ))
 }

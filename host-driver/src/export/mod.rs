@@ -1,0 +1,3 @@
+//! Files that others read: point clouds, images, reports. All appear whole or not at all.
+
+pub mod atomic;
