@@ -10,8 +10,10 @@ pub mod export;
 pub mod frame;
 pub mod geometry;
 pub mod raw;
+pub mod rectify;
 
 pub use calibration::{CameraIntrinsics, StereoCalibration};
 pub use frame::{DepthFrame, PointCloud, SlotLabel};
 pub use geometry::RectifiedGeometry;
 pub use raw::RawImage;
+pub use rectify::{DepthRange, Rectifier};
