@@ -11,6 +11,7 @@ pub mod frame;
 pub mod geometry;
 pub mod raw;
 pub mod rectify;
+pub mod register;
 
 pub use calibration::{CameraIntrinsics, StereoCalibration};
 pub use frame::{DepthFrame, PointCloud, SlotLabel};
