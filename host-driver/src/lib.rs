@@ -13,8 +13,15 @@ pub mod raw;
 pub mod rectify;
 pub mod register;
 
+// The live part: from sources to windows of pairs.
+pub mod clock;
+pub mod sync;
+pub mod uri;
+
 pub use calibration::{CameraIntrinsics, StereoCalibration};
 pub use frame::{DepthFrame, PointCloud, SlotLabel};
 pub use geometry::RectifiedGeometry;
 pub use raw::RawImage;
 pub use rectify::{DepthRange, Rectifier};
+
+pub use uri::{SourceUri, UriError};

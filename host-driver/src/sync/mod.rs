@@ -1,0 +1,85 @@
+//! From triggers and camera frames to windows of labelled stereo pairs.
+//!
+//! Everything here is a state machine without threads, clocks or hardware: times are arguments, what
+//! happened to every frame comes out.
+//!
+//! - [`fit`]: a camera's clock as a line over the device's.
+//! - [`pairer`]: which trigger a camera frame belongs to, and which two frames make a pair.
+//! - [`lock`]: how a camera's clock is tied to the device's in the first place.
+//! - [`window`]: the last N pairs, complete and consistent, or not at all.
+//!
+//! Invariants: a frame is labelled by a trigger event only when its timestamp and its sequence number
+//! agree on that event; every frame that goes in comes out exactly once, in a pair or with the cause
+//! of its rejection; a window never holds two pairs of one trigger or of two timings.
+
+pub mod fit;
+pub mod lock;
+pub mod pairer;
+pub mod window;
+
+use serde::{Deserialize, Serialize};
+
+/// One of the two cameras.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Side {
+    /// Camera 0.
+    Left,
+    /// Camera 1.
+    Right,
+}
+
+impl Side {
+    /// Both sides, left first.
+    pub const BOTH: [Side; 2] = [Side::Left, Side::Right];
+
+    /// 0 for the left camera, 1 for the right one.
+    pub fn index(self) -> usize {
+        self as usize
+    }
+}
+
+impl std::fmt::Display for Side {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Side::Left => "left",
+            Side::Right => "right",
+        })
+    }
+}
+
+/// What is known of a camera frame besides its pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FrameStamp {
+    /// Which camera.
+    pub side: Side,
+    /// The camera's own count of frames; 0 is the first after the camera was started.
+    pub sequence: u32,
+    /// The camera's own timestamp in nanoseconds of its clock: any fixed point of the exposure.
+    pub timestamp_camera_ns: u64,
+    /// When the frame was complete on the host, in nanoseconds of the host's clock.
+    pub arrival_host_ns: u64,
+    /// Fingerprint of the pixels, where they have enough noise for two frames never to be equal.
+    pub fingerprint: Option<u64>,
+}
+
+/// A trigger event as it reached the host.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Trigger {
+    /// What the device said of it.
+    pub label: crate::SlotLabel,
+    /// When the event reached the host, in nanoseconds of the host's clock.
+    pub arrival_host_ns: u64,
+}
+
+impl Trigger {
+    /// Start of the exposure in nanoseconds of the device's clock.
+    pub fn time_device_ns(&self) -> u64 {
+        self.label.trigger_time_us.saturating_mul(1000)
+    }
+
+    /// Length of the exposure in nanoseconds.
+    pub fn exposure_ns(&self) -> u64 {
+        u64::from(self.label.exposure_us) * 1000
+    }
+}
