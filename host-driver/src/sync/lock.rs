@@ -45,11 +45,12 @@ pub struct Lock {
     pub latencies_ns: Vec<(u32, i64)>,
 }
 
-/// Least time from a trigger to its event's arrival, as an offset from device to host time.
-///
-/// The least delayed event is the one that was not queued anywhere.
+/// Offset from device to host time: the least time from an exposure's end, when the device sends the
+/// trigger's event, to the event's arrival. The least delayed event was not queued anywhere.
 pub fn host_from_device_ns<'a>(triggers: impl Iterator<Item = &'a Trigger>) -> Option<i64> {
-    triggers.map(|t| t.arrival_host_ns.wrapping_sub(t.time_device_ns()) as i64).min()
+    triggers
+        .map(|t| t.arrival_host_ns.wrapping_sub(t.time_device_ns() + t.exposure_ns()) as i64)
+        .min()
 }
 
 /// Looks for the shift at which `frames` (of one camera) belong to `triggers` (in order). `None`
@@ -100,6 +101,15 @@ pub fn find(triggers: &[Trigger], frames: &[FrameStamp], config: &LockConfig) ->
     if found.len() < needed {
         return None;
     }
+    let prompt = |f: &FrameStamp, t: &Trigger| {
+        let latency_ns = f.arrival_host_ns as i64 - exposure_end_host_ns(t);
+        let slack_ns = config.slack_ns as i64;
+        (-slack_ns..config.period_ns as i64 - slack_ns).contains(&latency_ns)
+    };
+    // The newest frames' own arrivals must say the same, whatever the timestamps of others were.
+    if !found.iter().rev().take(FRAMES_AGREED).all(|(f, t, _)| prompt(f, t)) {
+        return None;
+    }
     let latency_ns = found.iter().map(|&(_, _, latency_ns)| latency_ns).min()?;
     let points_ns =
         found.iter().map(|(f, t, _)| (t.time_device_ns(), f.timestamp_camera_ns)).collect();
@@ -135,7 +145,7 @@ mod tests {
                 trigger_time_us: time_ns / 1000,
                 exposure_us: 32_000,
             },
-            arrival_host_ns: time_ns - 4_000_000_000 + 700_000,
+            arrival_host_ns: time_ns - 4_000_000_000 + 32_000_000 + 700_000,
         }
     }
 
@@ -171,10 +181,10 @@ mod tests {
 
     #[test]
     fn frames_all_a_period_late_wait_for_one_that_is_not() {
-        let triggers: Vec<_> = (0..12).map(trigger).collect();
+        let triggers: Vec<_> = (0..13).map(trigger).collect();
         let mut frames: Vec<_> = (0..8).map(|k| frame(k, k, PERIOD_NS)).collect();
         assert!(find(&triggers, &frames, &CONFIG).is_none());
-        frames.extend((8..11).map(|k| frame(k, k, 0)));
+        frames.extend((8..12).map(|k| frame(k, k, 0)));
         assert_eq!(find(&triggers, &frames, &CONFIG).map(|lock| lock.offset), Some(0));
     }
 

@@ -48,21 +48,22 @@ pub struct PairerConfig {
     pub tolerance_ns: u64,
     /// How much later than the least delayed frame an event may reach the host.
     pub slack_ns: u64,
-    /// Trigger sequence minus frame sequence at the start: `Some(0)` when the cameras were started
-    /// before the triggers.
-    pub counted_offset: Option<i64>,
+    /// Sequence of the first trigger, when the cameras were started before it, so that their first
+    /// frames are its.
+    pub first_sequence: Option<u32>,
 }
 
 impl PairerConfig {
-    /// Defaults for triggers every `period_us`, cameras started first.
-    pub fn new(period_us: u32) -> Self {
+    /// Defaults for triggers every `period_us`, of which the first is number `first_sequence`; the
+    /// cameras were started before.
+    pub fn new(period_us: u32, first_sequence: u32) -> Self {
         let period_ns = u64::from(period_us) * 1000;
         Self {
             period_ns,
             patience_ns: (3 * period_ns).max(100_000_000),
             tolerance_ns: (period_ns / 4).min(4_000_000),
             slack_ns: (period_ns / 8).min(4_000_000),
-            counted_offset: Some(0),
+            first_sequence: Some(first_sequence),
         }
     }
 }
@@ -169,6 +170,11 @@ struct Tied {
 }
 
 impl Tied {
+    fn misfit(&mut self, cause: Reject) -> Verdict {
+        self.misfits += 1;
+        if self.misfits >= MISFITS { Verdict::Unlock } else { Verdict::Reject(cause) }
+    }
+
     fn latency_ns(&self) -> i64 {
         self.recent.iter().map(|&(_, latency_ns)| latency_ns).min().unwrap_or(0)
     }
@@ -211,7 +217,7 @@ impl<F> Pairer<F> {
     pub fn new(config: PairerConfig) -> Self {
         let camera = || Camera {
             tied: None,
-            counted_offset: config.counted_offset,
+            counted_offset: config.first_sequence.map(i64::from),
             held: VecDeque::new(),
             seen: VecDeque::new(),
         };
@@ -220,8 +226,14 @@ impl<F> Pairer<F> {
             pending: VecDeque::new(),
             finished: VecDeque::new(),
             cameras: [camera(), camera()],
-            next_sequence: config.counted_offset.map(|_| 0),
+            next_sequence: config.first_sequence,
         }
+    }
+
+    /// Goes on with triggers every `period_us`: a new timing took effect.
+    pub fn set_period_us(&mut self, period_us: u32) {
+        let first_sequence = self.config.first_sequence;
+        self.config = PairerConfig { first_sequence, ..PairerConfig::new(period_us, 0) };
     }
 
     /// Takes a trigger event.
@@ -419,16 +431,8 @@ impl<F> Pairer<F> {
             }
             Some((_, Place::Finished { paired: false })) => return Verdict::Reject(Reject::Late),
             None if patient => return Verdict::Wait,
-            None => {
-                tied.misfits += 1;
-                return if tied.misfits >= MISFITS {
-                    Verdict::Unlock
-                } else {
-                    Verdict::Reject(Reject::NoTrigger)
-                };
-            }
+            None => return tied.misfit(Reject::NoTrigger),
         };
-        tied.misfits = 0;
         let end_ns = (trigger.time_device_ns() + trigger.exposure_ns()) as i64;
         let latency_ns = stamp.arrival_host_ns as i64 - end_ns - host_from_device_ns.unwrap_or(0);
         let usual = (latency_ns - tied.latency_ns()).unsigned_abs() < self.config.period_ns / 2;
@@ -450,10 +454,16 @@ impl<F> Pairer<F> {
             tied.recent.clear();
         } else if latency_ns < -(self.config.slack_ns as i64) {
             return Verdict::Reject(Reject::Mislabelled);
-        } else if !usual && confirmations.is_none_or(|count| count < CONFIRM_LATE) {
-            return if patient { Verdict::Wait } else { Verdict::Reject(Reject::Late) };
+        } else if !usual
+            && (tied.changed.is_some() || confirmations.is_none_or(|count| count < CONFIRM_LATE))
+        {
+            if patient {
+                return Verdict::Wait;
+            }
+            return tied.misfit(Reject::Late);
         }
         tied.changed = None;
+        tied.misfits = 0;
         if self.pending[at].frames[stamp.side.index()].is_some() {
             return Verdict::Reject(Reject::Duplicate);
         }
