@@ -116,10 +116,9 @@ impl FromStr for SourceUri {
     }
 }
 
-fn split_options<'a>(
-    uri: &str,
-    rest: &'a str,
-) -> Result<(&'a str, Vec<(String, String)>), UriError> {
+type Options = Vec<(String, String)>;
+
+fn split_options<'a>(uri: &str, rest: &'a str) -> Result<(&'a str, Options), UriError> {
     let Some((path, query)) = rest.split_once('?') else { return Ok((rest, Vec::new())) };
     let options = query
         .split('&')
