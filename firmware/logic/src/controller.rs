@@ -60,6 +60,36 @@ pub struct Identity {
     pub capabilities: Capabilities,
 }
 
+/// Version of this firmware: the logic's, on whatever board it runs.
+pub const FIRMWARE_VERSION: FirmwareVersion = FirmwareVersion {
+    major: decimal(env!("CARGO_PKG_VERSION_MAJOR")),
+    minor: decimal(env!("CARGO_PKG_VERSION_MINOR")),
+    patch: decimal(env!("CARGO_PKG_VERSION_PATCH")),
+};
+
+const fn decimal(digits: &str) -> u8 {
+    match u8::from_str_radix(digits, 10) {
+        Ok(number) => number,
+        Err(_) => 0,
+    }
+}
+
+impl Identity {
+    /// A board with everything that it can have.
+    #[must_use]
+    pub const fn new(board: BoardKind, serial: SerialNumber) -> Self {
+        let both = Capabilities::SETTINGS_STORE
+            .union(Capabilities::BOOTLOADER)
+            .union(Capabilities::FLOODLIGHT)
+            .union(Capabilities::TEMPERATURE);
+        let capabilities = match board {
+            BoardKind::F330 => both,
+            BoardKind::F350 => both.union(Capabilities::USB_SOF),
+        };
+        Self { board, serial, firmware: FIRMWARE_VERSION, capabilities }
+    }
+}
+
 /// How the controller came up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Boot {

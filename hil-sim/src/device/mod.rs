@@ -1,5 +1,9 @@
 //! The sensor's controller as seen from outside: bytes of the control link in and out, edges of its
 //! pins, all in virtual time.
+//!
+//! [`in_process`] runs the firmware's logic on the host.
+
+pub mod in_process;
 
 /// An output of the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
