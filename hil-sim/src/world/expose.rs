@@ -1,0 +1,282 @@
+//! Exposures: light over the gates' waveform, and the sensor's way from electrons to numbers.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+
+use nalgebra::Isometry3;
+use rayon::prelude::*;
+
+use super::camera::{CameraModel, full_scale};
+use super::gbuffer::{GBuffer, View};
+use super::geometry::Rigid;
+use super::illuminate::{ambient, illuminate};
+use super::noise::{KeyedRng, key, read_pixel_e};
+use super::projector::Light;
+use super::psf::Response;
+use super::scene::Scene;
+
+/// One of the two cameras.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Camera {
+    /// Camera 0.
+    Left,
+    /// Camera 1.
+    Right,
+}
+
+/// One of the sensor's lights.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum LightSource {
+    /// A speckle projector, by its slot in [`SensorModel::projectors`](super::SensorModel).
+    Projector(u8),
+    /// The floodlight.
+    Floodlight,
+}
+
+/// A time during which a light is on. A light that the sensor does not have stays dark.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LightInterval {
+    /// Which light.
+    pub source: LightSource,
+    /// Gate on.
+    pub on_ns: u64,
+    /// Gate off.
+    pub off_ns: u64,
+}
+
+/// An image as the camera's sensor gives it: unrectified, row by row.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RawImage {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Bits per pixel; numbers are below `1 << bits`.
+    pub bits: u8,
+    /// Pixels, row by row.
+    pub data: Vec<u16>,
+}
+
+impl RawImage {
+    /// The pixels as bytes, if the image has 8 bits.
+    #[must_use]
+    pub fn to_gray8(&self) -> Option<Vec<u8>> {
+        (self.bits <= 8).then(|| self.data.iter().map(|&v| v as u8).collect())
+    }
+}
+
+/// Image of light per second at each pixel, vignetting included.
+type RateImage = Arc<Vec<f32>>;
+
+/// What makes an image: a light or the surroundings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Origin {
+    Light(LightSource),
+    Ambient,
+}
+
+/// A camera in the world, with the images of a still scene that were needed so far.
+pub(crate) struct CameraUnit {
+    pub model: CameraModel,
+    pub left_from_camera: Rigid,
+    response: Response,
+    /// Vignetting times pixel sensitivity.
+    sensitivity: Vec<f32>,
+    noise_seed: u64,
+    still: Mutex<Still>,
+}
+
+#[derive(Default)]
+struct Still {
+    gbuffer: Option<Arc<GBuffer>>,
+    images: BTreeMap<Origin, RateImage>,
+}
+
+/// The scene's lights and surroundings.
+pub(crate) struct Lights {
+    pub projectors: Vec<Light>,
+    pub floodlight: Light,
+    pub ambient_e_per_s: f64,
+}
+
+impl Lights {
+    fn get(&self, source: LightSource) -> Option<&Light> {
+        match source {
+            LightSource::Projector(i) => self.projectors.get(usize::from(i)),
+            LightSource::Floodlight => Some(&self.floodlight),
+        }
+    }
+}
+
+/// Movement within one sub-exposure, as a share of a pixel at 1 m, below which it is not divided.
+const SHARP_PX: f64 = 0.25;
+/// Most sub-exposures of one light.
+const MOST_SUB_EXPOSURES: u64 = 16;
+
+impl CameraUnit {
+    pub fn new(model: &CameraModel, left_from_camera: &Isometry3<f64>, seed: u64) -> Self {
+        let mut sensitivity = vec![0.0_f32; model.width * model.height];
+        sensitivity.par_chunks_mut(model.width).enumerate().for_each(|(v, line)| {
+            for (u, out) in line.iter_mut().enumerate() {
+                let cosine = model.ray_direction([u as f64, v as f64]).z;
+                let pixel = key(seed, (v * model.width + u) as u64);
+                let gain = 1.0 + model.prnu * KeyedRng::new(pixel).normal();
+                *out = (cosine.powf(model.vignetting_exponent) * gain.max(0.0)) as f32;
+            }
+        });
+        Self {
+            model: model.clone(),
+            left_from_camera: Rigid::from(left_from_camera),
+            response: Response::new(model.blur_sigma_px),
+            sensitivity,
+            noise_seed: key(seed, 0xf4a),
+            still: Mutex::default(),
+        }
+    }
+
+    pub fn expose(
+        &self,
+        scene: &Scene,
+        lights: &Lights,
+        open_ns: u64,
+        close_ns: u64,
+        intervals: &[LightInterval],
+        frame_seed: u64,
+    ) -> RawImage {
+        let mut electrons = vec![0.0_f32; self.model.width * self.model.height];
+        let mut add = |image: &[f32], seconds: f64| {
+            electrons
+                .par_iter_mut()
+                .zip(image)
+                .for_each(|(sum, rate)| *sum += rate * seconds as f32);
+        };
+        let overlaps = intervals.iter().filter_map(|light| {
+            let (on, off) = (light.on_ns.max(open_ns), light.off_ns.min(close_ns));
+            (on < off).then_some((light.source, on, off))
+        });
+        let open_s = close_ns.saturating_sub(open_ns) as f64 * 1e-9;
+        let surroundings_s = if lights.ambient_e_per_s > 0.0 { open_s } else { 0.0 };
+        if scene.is_still() {
+            for (source, on, off) in overlaps {
+                if lights.get(source).is_some() {
+                    let image = self.still_image(scene, lights, Origin::Light(source));
+                    add(&image, (off - on) as f64 * 1e-9);
+                }
+            }
+            if surroundings_s > 0.0 {
+                add(&self.still_image(scene, lights, Origin::Ambient), surroundings_s);
+            }
+        } else {
+            let mut views = BTreeMap::new();
+            for (source, on, off) in overlaps {
+                if lights.get(source).is_none() {
+                    continue;
+                }
+                let parts = self.sub_exposures(scene, off - on);
+                for part in 0..parts {
+                    let time_ns = on + (off - on) * (2 * part + 1) / (2 * parts);
+                    let gbuffer = views.entry(time_ns).or_insert_with(|| self.look(scene, time_ns));
+                    let image = self.image(scene, lights, gbuffer, time_ns, Origin::Light(source));
+                    add(&image, (off - on) as f64 * 1e-9 / parts as f64);
+                }
+            }
+            if surroundings_s > 0.0 {
+                // Ambient light is weak: one look is enough, the one in the middle if there is any.
+                let middle = views.keys().nth(views.len() / 2).copied();
+                let time_ns = middle.unwrap_or(open_ns / 2 + close_ns / 2);
+                let gbuffer = views.entry(time_ns).or_insert_with(|| self.look(scene, time_ns));
+                let image = self.image(scene, lights, gbuffer, time_ns, Origin::Ambient);
+                add(&image, surroundings_s);
+            }
+        }
+        self.read_out(&electrons, frame_seed)
+    }
+
+    fn sub_exposures(&self, scene: &Scene, duration_ns: u64) -> u64 {
+        let moved_m = scene.speed_m_per_s() * duration_ns as f64 * 1e-9;
+        let moved_px = moved_m * self.model.focal_px[0];
+        ((moved_px / SHARP_PX).ceil() as u64).clamp(1, MOST_SUB_EXPOSURES)
+    }
+
+    fn view(&self) -> View<'_> {
+        View {
+            camera: &self.model,
+            left_from_camera: self.left_from_camera,
+            margin: self.response.margin(),
+        }
+    }
+
+    fn look(&self, scene: &Scene, time_ns: u64) -> GBuffer {
+        GBuffer::new(&self.view(), &scene.at(time_ns))
+    }
+
+    /// The image of a still scene, made when first asked for. Nothing is computed under the lock: a
+    /// worker that waits for its share could be handed another exposure of this camera meanwhile.
+    fn still_image(&self, scene: &Scene, lights: &Lights, origin: Origin) -> RateImage {
+        let known = |still: &Still| still.images.get(&origin).cloned();
+        let gbuffer = {
+            let still = self.lock();
+            if let Some(image) = known(&still) {
+                return image;
+            }
+            still.gbuffer.clone()
+        };
+        let gbuffer = gbuffer.unwrap_or_else(|| {
+            let gbuffer = Arc::new(self.look(scene, 0));
+            self.lock().gbuffer.get_or_insert(gbuffer).clone()
+        });
+        let image = Arc::new(self.image(scene, lights, &gbuffer, 0, origin));
+        self.lock().images.entry(origin).or_insert(image).clone()
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Still> {
+        // A panic elsewhere cannot leave the cache half-written: entries are added whole.
+        self.still.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
+    fn image(
+        &self,
+        scene: &Scene,
+        lights: &Lights,
+        gbuffer: &GBuffer,
+        time_ns: u64,
+        origin: Origin,
+    ) -> Vec<f32> {
+        let cells = match origin {
+            Origin::Ambient => ambient(gbuffer, lights.ambient_e_per_s),
+            Origin::Light(source) => match lights.get(source) {
+                Some(light) => {
+                    let centre = &self.left_from_camera.translation;
+                    illuminate(light, gbuffer, &scene.at(time_ns), centre)
+                }
+                None => vec![0.0; gbuffer.cells.len()],
+            },
+        };
+        let (width, height) = (self.model.width, self.model.height);
+        let mut image = self.response.apply(&cells, gbuffer.columns, width, height);
+        image.iter_mut().zip(&self.sensitivity).for_each(|(rate, s)| *rate *= s);
+        image
+    }
+
+    /// Electrons to numbers: shot noise, read noise, full well, gain, black level, quantisation.
+    fn read_out(&self, electrons: &[f32], frame_seed: u64) -> RawImage {
+        let m = &self.model;
+        let frame_key = key(self.noise_seed, frame_seed);
+        let (gain, black) = (m.gain_dn_per_e as f32, m.black_level_dn as f32);
+        let (full_well, top) = (m.full_well_e as f32, full_scale(m.bits) as f32);
+        let mut data = vec![0_u16; electrons.len()];
+        data.par_chunks_mut(m.width).enumerate().for_each(|(v, line)| {
+            for (u, out) in line.iter_mut().enumerate() {
+                let index = v * m.width + u;
+                let e = read_pixel_e(
+                    key(frame_key, index as u64),
+                    electrons[index],
+                    m.read_noise_e as f32,
+                );
+                let dn = e.min(full_well) * gain + black;
+                *out = dn.round().clamp(0.0, top) as u16;
+            }
+        });
+        RawImage { width: m.width, height: m.height, bits: m.bits, data }
+    }
+}

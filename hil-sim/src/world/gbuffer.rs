@@ -1,0 +1,178 @@
+//! What each camera sees, before any light: the surface behind every half pixel.
+//!
+//! The image plane is sampled on a grid of cells of half a pixel. The finest dots that the camera
+//! resolves are band limited far below this grid, so summing cells with the lens' and pixel's
+//! response (see [`super::psf`]) gives the irradiance without aliasing. Where the grid would alias, at
+//! edges of objects and prints, the cell is sampled 16 times more finely.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::camera::CameraModel;
+use super::geometry::{Ray, Rigid};
+use super::scene::PosedScene;
+
+/// Cells per pixel in each direction.
+pub(crate) const CELLS_PER_PIXEL: usize = 2;
+/// Samples along one side of a refined cell.
+const FINE: usize = 4;
+/// Samples of a refined cell.
+pub(crate) const FINE_SAMPLES: usize = FINE * FINE;
+/// Nothing is looked for beyond this distance.
+const FARTHEST_M: f64 = 50.0;
+
+/// A camera in the scene.
+pub(crate) struct View<'a> {
+    pub camera: &'a CameraModel,
+    pub left_from_camera: Rigid,
+    /// Cells around the image, from which the lens blurs light into it.
+    pub margin: usize,
+}
+
+impl View<'_> {
+    pub fn columns(&self) -> usize {
+        CELLS_PER_PIXEL * self.camera.width + 2 * self.margin
+    }
+
+    pub fn rows(&self) -> usize {
+        CELLS_PER_PIXEL * self.camera.height + 2 * self.margin
+    }
+
+    /// Pixel coordinate of a cell's centre, given the cell's index along the same axis.
+    fn pixel(&self, cell: f64) -> f64 {
+        (cell - self.margin as f64 + 0.5) / CELLS_PER_PIXEL as f64 - 0.5
+    }
+
+    fn ray(&self, normalised: [f64; 2]) -> Ray {
+        let direction = Vector3::new(normalised[0], normalised[1], 1.0).normalize();
+        Ray {
+            origin: self.left_from_camera.translation,
+            direction: self.left_from_camera.vector(&direction),
+        }
+    }
+}
+
+/// The surface seen at one sample. Kept small: a full-resolution view has five million.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Sample {
+    /// In the left camera's frame. Rounding to f32 moves a point by at most 0.12 micrometres at 2 m,
+    /// less than 0.0002 px.
+    point: [f32; 3],
+    normal: [i16; 3],
+    albedo: u16,
+    object: u16,
+}
+
+const NO_OBJECT: u16 = u16::MAX;
+
+impl Sample {
+    const NOTHING: Self = Self { point: [0.0; 3], normal: [0; 3], albedo: 0, object: NO_OBJECT };
+
+    pub fn is_surface(&self) -> bool {
+        self.object != NO_OBJECT
+    }
+
+    pub fn object(&self) -> usize {
+        usize::from(self.object)
+    }
+
+    pub fn point(&self) -> Vector3<f64> {
+        Vector3::new(f64::from(self.point[0]), f64::from(self.point[1]), f64::from(self.point[2]))
+    }
+
+    pub fn normal(&self) -> Vector3<f64> {
+        let n = self.normal.map(|v| f64::from(v) * (1.0 / 32767.0));
+        Vector3::new(n[0], n[1], n[2])
+    }
+
+    pub fn albedo(&self) -> f64 {
+        f64::from(self.albedo) * (1.0 / 65535.0)
+    }
+
+    /// Whether the surface between two neighbouring samples is one smooth piece.
+    pub fn continues_to(&self, other: &Self) -> bool {
+        if self.object != other.object {
+            return false;
+        }
+        if !self.is_surface() {
+            return true;
+        }
+        let step = other.point() - self.point();
+        let (n, m) = (self.normal(), other.normal());
+        let length = step.norm();
+        // A smooth surface stays near the tangent planes, even one seen at 80 degrees (where
+        // neighbours are six cells' widths apart); a step leaves both.
+        let rise = step.dot(&n).abs().min(step.dot(&m).abs());
+        rise <= 0.35 * length + 1e-6
+            && n.dot(&m) > 0.75
+            && self.albedo.abs_diff(other.albedo) < 2000
+    }
+}
+
+/// All samples of a view.
+pub(crate) struct GBuffer {
+    pub columns: usize,
+    pub cells: Vec<Sample>,
+    /// Indices of the refined cells, ascending.
+    pub refined: Vec<u32>,
+    /// [`FINE_SAMPLES`] for each refined cell.
+    pub fine: Vec<Sample>,
+}
+
+impl GBuffer {
+    pub fn new(view: &View<'_>, scene: &PosedScene<'_>) -> Self {
+        let (columns, rows) = (view.columns(), view.rows());
+        let mut cells = vec![Sample::NOTHING; columns * rows];
+        cells.par_chunks_mut(columns).enumerate().for_each(|(row, line)| {
+            let v = view.pixel(row as f64);
+            let mut near = view.camera.unproject([view.pixel(0.0), v]);
+            for (column, cell) in line.iter_mut().enumerate() {
+                let pixel = [view.pixel(column as f64), v];
+                near = view.camera.unproject_from(pixel, near);
+                *cell = look(scene, &view.ray(near));
+            }
+        });
+        let refined: Vec<u32> = (0..rows)
+            .into_par_iter()
+            .flat_map_iter(|row| {
+                let cells = &cells;
+                (0..columns).filter_map(move |column| {
+                    let index = row * columns + column;
+                    let continues = |other: usize| cells[index].continues_to(&cells[other]);
+                    let is_smooth = (column == 0 || continues(index - 1))
+                        && (column + 1 == columns || continues(index + 1))
+                        && (row == 0 || continues(index - columns))
+                        && (row + 1 == rows || continues(index + columns));
+                    (!is_smooth).then_some(index as u32)
+                })
+            })
+            .collect();
+        let mut fine = vec![Sample::NOTHING; refined.len() * FINE_SAMPLES];
+        fine.par_chunks_mut(FINE_SAMPLES).zip(&refined).for_each(|(samples, &index)| {
+            let (row, column) = (index as usize / columns, index as usize % columns);
+            let offset = |k: usize| (k as f64 + 0.5) / FINE as f64 - 0.5;
+            let centre = [view.pixel(column as f64), view.pixel(row as f64)];
+            let near = view.camera.unproject(centre);
+            for (k, sample) in samples.iter_mut().enumerate() {
+                let pixel = [
+                    view.pixel(column as f64 + offset(k % FINE)),
+                    view.pixel(row as f64 + offset(k / FINE)),
+                ];
+                *sample = look(scene, &view.ray(view.camera.unproject_from(pixel, near)));
+            }
+        });
+        Self { columns, cells, refined, fine }
+    }
+}
+
+fn look(scene: &PosedScene<'_>, ray: &Ray) -> Sample {
+    let Some((object, hit)) = scene.nearest(ray, FARTHEST_M) else { return Sample::NOTHING };
+    let point = ray.at(hit.distance_m);
+    let albedo = scene.albedo(object, &point).clamp(0.0, 1.0);
+    Sample {
+        point: [point.x as f32, point.y as f32, point.z as f32],
+        normal: [hit.normal.x, hit.normal.y, hit.normal.z].map(|v| (v * 32767.0).round() as i16),
+        albedo: (albedo * 65535.0).round() as u16,
+        object: object as u16,
+    }
+}

@@ -1,0 +1,216 @@
+//! Objects, where they are at a time, and which of them a ray meets.
+
+use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
+
+use super::geometry::{Hit, Ray, Rigid, transform_point};
+use super::material::Material;
+use super::shapes::Shape;
+
+/// How an object moves. Times are virtual time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Motion {
+    Still,
+    /// Constant velocity, in the left camera's frame.
+    Linear {
+        velocity_m_per_s: Vector3<f64>,
+    },
+    /// Constant turning about a fixed axis, in the left camera's frame.
+    Turning {
+        through: Vector3<f64>,
+        axis: Unit<Vector3<f64>>,
+        rad_per_s: f64,
+    },
+}
+
+impl Motion {
+    /// What the motion does to a point in `seconds`.
+    fn displacement(&self, seconds: f64) -> Isometry3<f64> {
+        match self {
+            Self::Still => Isometry3::identity(),
+            Self::Linear { velocity_m_per_s } => Isometry3::from_parts(
+                Translation3::from(velocity_m_per_s * seconds),
+                UnitQuaternion::identity(),
+            ),
+            Self::Turning { through, axis, rad_per_s } => {
+                let rotation = UnitQuaternion::from_axis_angle(axis, rad_per_s * seconds);
+                Isometry3::from_parts((through - rotation * through).into(), rotation)
+            }
+        }
+    }
+
+    /// Speed of a point in metres per second.
+    fn speed_m_per_s(&self, point: &Vector3<f64>) -> f64 {
+        match self {
+            Self::Still => 0.0,
+            Self::Linear { velocity_m_per_s } => velocity_m_per_s.norm(),
+            Self::Turning { through, axis, rad_per_s } => {
+                (point - through).cross(axis).norm() * rad_per_s.abs()
+            }
+        }
+    }
+}
+
+/// A thing in the scene.
+pub(crate) struct Object {
+    pub name: &'static str,
+    pub shape: Box<dyn Shape>,
+    /// Pose at time 0.
+    pub left_from_object: Isometry3<f64>,
+    pub motion: Motion,
+    pub material: Material,
+    /// Radius about the object's origin within which its motion is judged.
+    pub reach_m: f64,
+}
+
+/// All objects.
+pub(crate) struct Scene {
+    pub objects: Vec<Object>,
+}
+
+impl Scene {
+    pub fn is_still(&self) -> bool {
+        self.objects.iter().all(|o| o.motion == Motion::Still)
+    }
+
+    /// The fastest point's speed, about.
+    pub fn speed_m_per_s(&self) -> f64 {
+        self.objects
+            .iter()
+            .map(|o| {
+                let edge =
+                    o.left_from_object.translation.vector + Vector3::new(o.reach_m, 0.0, 0.0);
+                o.motion.speed_m_per_s(&edge)
+            })
+            .fold(0.0, f64::max)
+    }
+
+    /// Pose of an object at a time.
+    pub fn left_from_object(&self, object: usize, time_ns: u64) -> Isometry3<f64> {
+        let o = &self.objects[object];
+        o.motion.displacement(time_ns as f64 * 1e-9) * o.left_from_object
+    }
+
+    /// The scene frozen at a time.
+    pub fn at(&self, time_ns: u64) -> PosedScene<'_> {
+        let poses = (0..self.objects.len())
+            .map(|i| Rigid::from(&self.left_from_object(i, time_ns)))
+            .collect();
+        PosedScene { scene: self, poses }
+    }
+}
+
+/// The scene at one time.
+pub(crate) struct PosedScene<'a> {
+    pub scene: &'a Scene,
+    poses: Vec<Rigid>,
+}
+
+impl PosedScene<'_> {
+    /// The nearest surface on a ray of the left camera's frame; the normal is turned to the ray's
+    /// origin.
+    pub fn nearest(&self, ray: &Ray, max_m: f64) -> Option<(usize, Hit)> {
+        let mut best: Option<(usize, Hit)> = None;
+        let mut max_m = max_m;
+        for (i, (object, pose)) in self.scene.objects.iter().zip(&self.poses).enumerate() {
+            if let Some(hit) = object.shape.intersect(&local(pose, ray), max_m) {
+                max_m = hit.distance_m;
+                best = Some((i, Hit { normal: pose.vector(&hit.normal), ..hit }));
+            }
+        }
+        best.map(|(i, mut hit)| {
+            if hit.normal.dot(&ray.direction) > 0.0 {
+                hit.normal = -hit.normal;
+            }
+            (i, hit)
+        })
+    }
+
+    /// Whether anything is on the ray before `max_m`.
+    pub fn is_occluded(&self, ray: &Ray, max_m: f64) -> bool {
+        self.scene
+            .objects
+            .iter()
+            .zip(&self.poses)
+            .any(|(object, pose)| object.shape.occludes(&local(pose, ray), max_m))
+    }
+
+    /// Diffuse albedo of an object at a point of the left camera's frame.
+    pub fn albedo(&self, object: usize, point_left_m: &Vector3<f64>) -> f64 {
+        let local = self.poses[object].inverse_point(point_left_m);
+        self.scene.objects[object].material.albedo(&local)
+    }
+}
+
+fn local(pose: &Rigid, ray: &Ray) -> Ray {
+    Ray { origin: pose.inverse_point(&ray.origin), direction: pose.inverse_vector(&ray.direction) }
+}
+
+/// A still object.
+pub(crate) fn still(
+    name: &'static str,
+    shape: impl Shape + 'static,
+    left_from_object: Isometry3<f64>,
+    material: Material,
+) -> Object {
+    Object {
+        name,
+        shape: Box::new(shape),
+        left_from_object,
+        motion: Motion::Still,
+        material,
+        reach_m: 0.0,
+    }
+}
+
+/// An object that turns about an axis of its own frame.
+pub(crate) fn turning(mut object: Object, axis: Vector3<f64>, rpm: f64, reach_m: f64) -> Object {
+    let pose = object.left_from_object;
+    object.motion = Motion::Turning {
+        through: transform_point(&pose, &Vector3::zeros()),
+        axis: Unit::new_normalize(pose.rotation * axis),
+        rad_per_s: rpm * std::f64::consts::TAU / 60.0,
+    };
+    object.reach_m = reach_m;
+    object
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::shapes::{Rectangle, Sphere};
+
+    #[test]
+    fn a_turning_object_keeps_its_axis_and_comes_back() {
+        let pose = Isometry3::new(Vector3::new(0.1, 0.2, 1.0), Vector3::new(0.2, 0.1, -0.3));
+        let object = still("ball", Sphere { radius_m: 0.1 }, pose, Material::matt(0.5));
+        let scene = Scene { objects: vec![turning(object, Vector3::y(), 1.2, 0.1)] };
+        let on_axis = Vector3::new(0.0, 0.07, 0.0);
+        let off_axis = Vector3::new(0.05, 0.07, 0.0);
+        let at = |p: &Vector3<f64>, t_s: f64| {
+            transform_point(&scene.left_from_object(0, (t_s * 1e9) as u64), p)
+        };
+        assert!((at(&on_axis, 0.0) - at(&on_axis, 17.0)).norm() < 1e-12);
+        assert!((at(&off_axis, 0.0) - at(&off_axis, 50.0)).norm() < 1e-9);
+        // A quarter turn of 12.5 s moves a point by sqrt(2) radii.
+        let moved = (at(&off_axis, 0.0) - at(&off_axis, 12.5)).norm();
+        assert!((moved - 0.05 * 2.0_f64.sqrt()).abs() < 1e-9);
+    }
+
+    #[test]
+    fn the_nearest_object_wins_and_the_normal_faces_the_viewer() {
+        let far = Isometry3::translation(0.0, 0.0, 2.0);
+        let near = Isometry3::translation(0.0, 0.0, 1.0);
+        let scene = Scene {
+            objects: vec![
+                still("wall", Rectangle { half_size_m: [1.0, 1.0] }, far, Material::matt(0.5)),
+                still("ball", Sphere { radius_m: 0.1 }, near, Material::matt(0.5)),
+            ],
+        };
+        let posed = scene.at(0);
+        let ray = Ray { origin: Vector3::zeros(), direction: Vector3::z() };
+        let (object, hit) = posed.nearest(&ray, 10.0).expect("something is ahead");
+        assert_eq!((object, hit.distance_m), (1, 0.9));
+        assert!(hit.normal.z < -0.99);
+        assert!(posed.is_occluded(&ray, 1.0) && !posed.is_occluded(&ray, 0.8));
+    }
+}
