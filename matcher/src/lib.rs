@@ -4,10 +4,12 @@
 //! all, parabola, reliability retry, left-right check, sub-pixel refinement by Stereo-DIC, and comes
 //! out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
 
+pub mod bspline;
 pub mod census;
 pub mod check;
 pub mod cost;
 pub mod error;
+pub mod icgn;
 pub mod image;
 pub mod level;
 pub mod matched;
@@ -19,6 +21,7 @@ mod retry;
 pub mod search;
 pub mod stack;
 pub mod wta;
+pub mod zncc;
 
 pub use error::Error;
 pub use image::Image;

@@ -1,6 +1,6 @@
 //! What a user can set: a few stable parameters, the rest under [`Advanced`].
 
-use crate::{Error, Level};
+use crate::{Error, Level, icgn::prepare::SUBSET_RADIUS_LIMIT};
 
 /// Largest magnitude of a disparity, in pixels.
 pub const DISPARITY_LIMIT_PX: i32 = 16_384;
@@ -160,7 +160,7 @@ impl Params {
         within("advanced.census_radius", a.census_radius, 1, RADIUS_LIMIT)?;
         within("advanced.retry_radius", a.retry_radius, a.census_radius, RADIUS_LIMIT)?;
         within("advanced.retry_similarity", a.retry_similarity, 0.0, 1.0)?;
-        within("advanced.subset_radius", a.subset_radius, 2, RADIUS_LIMIT)?;
+        within("advanced.subset_radius", a.subset_radius, 2, SUBSET_RADIUS_LIMIT)?;
         within("advanced.convergence_px", a.convergence_px, 1e-9, 1.0)?;
         within("advanced.iterations_max", a.iterations_max, 1, 1000)?;
         within("advanced.left_right_px", a.left_right_px, 0.0, 1e6)?;

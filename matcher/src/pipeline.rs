@@ -6,6 +6,7 @@ use crate::{
     Error, Image, Level, Matched, Method, Params, StageTime, StereoStack,
     census::PaddedStack,
     check,
+    icgn::{self, guess::CoarseMap, prepare::Prepared},
     parallel::Pool,
     search::{self, Coarse},
 };
@@ -25,6 +26,8 @@ pub struct Matcher {
     pool: Pool,
     left: PaddedStack,
     right: PaddedStack,
+    prepared: Prepared,
+    map: CoarseMap,
 }
 
 impl Matcher {
@@ -42,6 +45,8 @@ impl Matcher {
             pool,
             left: PaddedStack::default(),
             right: PaddedStack::default(),
+            prepared: Prepared::default(),
+            map: CoarseMap::default(),
         })
     }
 
@@ -69,10 +74,11 @@ impl Matcher {
         let pool = self.pool.clone();
         pool.install(|| match self.params.method {
             Method::Parabola => Ok(self.parabola(stack)),
-            Method::IcGn | Method::Dense => Err(Error::Parameter {
+            Method::IcGn => Ok(self.icgn(stack)),
+            Method::Dense => Err(Error::Parameter {
                 name: "method",
                 got: format!("{:?}", self.params.method),
-                allowed: "Parabola (the others are not built in)".to_owned(),
+                allowed: "Parabola or IcGn (Dense is not built in)".to_owned(),
             }),
         })
     }
@@ -101,6 +107,19 @@ impl Matcher {
             rate_px_per_s: None,
             stages: clock.stages,
         }
+    }
+
+    /// The coarse search, refined by Stereo-DIC.
+    fn icgn(&mut self, stack: &StereoStack<'_>) -> Matched {
+        let mut clock = Clock::start();
+        let coarse = self.coarse(stack, &mut clock);
+        self.prepared.fill(stack, self.params.advanced.interpolation);
+        self.map.fill(&coarse.disparity_px);
+        clock.stage("prepare");
+        let (disparity_px, zncc) =
+            icgn::refine_map(&self.prepared, &self.map, &self.params, self.level);
+        clock.stage("icgn");
+        Matched { disparity_px, zncc, rate_px_per_s: None, stages: clock.stages }
     }
 }
 
