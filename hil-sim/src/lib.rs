@@ -5,4 +5,5 @@
 //! gate waveform that the controller produced.
 
 pub mod device;
+pub mod front;
 pub mod world;

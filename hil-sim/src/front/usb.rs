@@ -1,0 +1,141 @@
+//! A USB device as its host sees it: control, bulk and interrupt transfers that are answered, refused
+//! or not yet ready.
+
+/// The eight bytes that begin a control transfer (USB 2.0 section 9.3).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Setup {
+    /// Direction (bit 7), type (bits 5-6) and recipient (bits 0-4).
+    pub request_type: u8,
+    /// bRequest.
+    pub request: u8,
+    /// wValue.
+    pub value: u16,
+    /// wIndex.
+    pub index: u16,
+    /// wLength.
+    pub length: u16,
+}
+
+impl Setup {
+    /// Reads the packet as it is on the wire.
+    pub fn parse(bytes: [u8; 8]) -> Self {
+        let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]);
+        Self {
+            request_type: bytes[0],
+            request: bytes[1],
+            value: word(2),
+            index: word(4),
+            length: word(6),
+        }
+    }
+
+    /// Whether the data stage goes to the host.
+    pub fn is_in(&self) -> bool {
+        self.request_type & 0x80 != 0
+    }
+
+    /// Type of the request: standard, class or vendor.
+    pub fn kind(&self) -> Kind {
+        match (self.request_type >> 5) & 3 {
+            0 => Kind::Standard,
+            1 => Kind::Class,
+            2 => Kind::Vendor,
+            _ => Kind::Reserved,
+        }
+    }
+
+    /// Recipient: 0 device, 1 interface, 2 endpoint.
+    pub fn recipient(&self) -> u8 {
+        self.request_type & 0x1f
+    }
+}
+
+/// Type of a control request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// USB 2.0 chapter 9.
+    Standard,
+    /// A device class's.
+    Class,
+    /// The vendor's.
+    Vendor,
+    /// Not defined.
+    Reserved,
+}
+
+/// How a device answers a transfer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Answer<T> {
+    /// Done.
+    Done(T),
+    /// Not now: the host tries again until it gives up.
+    Nak,
+    /// Refused; a halted endpoint stays so until the host clears it.
+    Stall,
+}
+
+/// Bus speed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Speed {
+    /// 12 Mbit/s.
+    Full,
+    /// 480 Mbit/s.
+    High,
+}
+
+/// What a host learns of a device before it opens it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Identity {
+    /// Bus speed.
+    pub speed: Speed,
+    /// The 18 bytes of the device descriptor.
+    pub device_descriptor: [u8; 18],
+    /// Class, subclass and protocol of each interface.
+    pub interfaces: Vec<[u8; 3]>,
+}
+
+impl Identity {
+    /// Reads what a configuration descriptor says of its interfaces (alternate setting 0).
+    pub fn new(speed: Speed, device_descriptor: [u8; 18], configuration: &[u8]) -> Self {
+        let interfaces = descriptors(configuration)
+            .filter(|d| d.len() >= 9 && d[1] == 4 && d[3] == 0)
+            .map(|d| [d[5], d[6], d[7]])
+            .collect();
+        Self { speed, device_descriptor, interfaces }
+    }
+}
+
+/// The descriptors in a configuration, each with its length and type bytes; ends at the first that
+/// does not fit.
+pub fn descriptors(mut bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
+    std::iter::from_fn(move || {
+        let length = usize::from(*bytes.first()?);
+        if length < 2 || length > bytes.len() {
+            return None;
+        }
+        let (descriptor, rest) = bytes.split_at(length);
+        bytes = rest;
+        Some(descriptor)
+    })
+}
+
+/// A USB device behind a port.
+pub trait UsbFunction: Send {
+    /// What it is.
+    fn identity(&self) -> Identity;
+
+    /// The port is reset: back to the default state.
+    fn reset(&mut self);
+
+    /// A control transfer with its data stage: `data` from the host, or the answer to it.
+    fn control(&mut self, setup: Setup, data: &[u8]) -> Answer<Vec<u8>>;
+
+    /// A bulk or interrupt IN transfer of at most `length` bytes; a shorter answer ends it.
+    fn transfer_in(&mut self, endpoint: u8, length: usize) -> Answer<Vec<u8>>;
+
+    /// A bulk or interrupt OUT transfer.
+    fn transfer_out(&mut self, endpoint: u8, data: &[u8]) -> Answer<usize>;
+
+    /// Lets the device do what is due. Called at least every millisecond or so of the server's time.
+    fn poll(&mut self);
+}

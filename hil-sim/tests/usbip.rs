@@ -1,0 +1,244 @@
+//! The USB/IP server with a camera behind it, spoken to over loopback as a kernel would.
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use stspp_hil_sim::front::usb::UsbFunction;
+use stspp_hil_sim::front::usbip::server::{Export, Server};
+use stspp_hil_sim::front::uvc::descriptors::{Description, PixelFormat};
+use stspp_hil_sim::front::uvc::{Frame, FrameSource, Settings, UvcCamera};
+
+const WIDTH: u16 = 100;
+const HEIGHT: u16 = 70;
+
+/// Gives one frame per poll while `left` lasts; each pixel is the gain plus its index.
+struct Counting {
+    left: Arc<Mutex<u32>>,
+}
+
+impl FrameSource for Counting {
+    fn poll(&mut self, settings: Settings) -> Option<Frame> {
+        let mut left = self.left.lock().unwrap();
+        *left = left.checked_sub(1)?;
+        let first = settings.gain_percent as usize;
+        let pixels = (0..usize::from(WIDTH) * usize::from(HEIGHT)).map(|i| (first + i) as u8);
+        Some(Frame { pixels: pixels.collect(), exposure_ticks: 48_000, sof: 5 })
+    }
+
+    fn clock(&self) -> (u32, u16) {
+        (96_000, 7)
+    }
+}
+
+struct Host {
+    stream: TcpStream,
+    sequence: u32,
+}
+
+/// Status and data of a reply.
+type Reply = (i32, Vec<u8>);
+
+impl Host {
+    fn connect(port: u16) -> Self {
+        let stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        Self { stream, sequence: 0 }
+    }
+
+    fn bytes(&mut self, count: usize) -> Vec<u8> {
+        let mut bytes = vec![0; count];
+        self.stream.read_exact(&mut bytes).unwrap();
+        bytes
+    }
+
+    fn import(&mut self, bus_id: &str) -> Option<Vec<u8>> {
+        let mut request = vec![1, 0x11, 0x80, 0x03, 0, 0, 0, 0];
+        request.extend(bus_id.as_bytes());
+        request.resize(8 + 32, 0);
+        self.stream.write_all(&request).unwrap();
+        let head = self.bytes(8);
+        (head[7] == 0).then(|| self.bytes(312))
+    }
+
+    fn send(
+        &mut self,
+        is_in: bool,
+        endpoint: u32,
+        length: usize,
+        setup: [u8; 8],
+        data: &[u8],
+    ) -> u32 {
+        self.sequence += 1;
+        let fields =
+            [1, self.sequence, 0x10001, u32::from(is_in), endpoint, 0, length as u32, 0, 0, 0];
+        let mut command: Vec<u8> = fields.iter().flat_map(|f: &u32| f.to_be_bytes()).collect();
+        command.extend(setup);
+        command.extend(data);
+        self.stream.write_all(&command).unwrap();
+        self.sequence
+    }
+
+    fn reply(&mut self, is_in: bool) -> (u32, u32, Reply) {
+        let head = self.bytes(48);
+        let word = |at: usize| u32::from_be_bytes(head[at..at + 4].try_into().unwrap());
+        let data = if word(0) == 3 && is_in { self.bytes(word(24) as usize) } else { vec![] };
+        (word(0), word(4), (word(20) as i32, data))
+    }
+
+    fn control(&mut self, setup: [u8; 8], data: &[u8]) -> Reply {
+        let is_in = setup[0] & 0x80 != 0;
+        let length = usize::from(u16::from_le_bytes([setup[6], setup[7]]));
+        let sequence = self.send(is_in, 0, length, setup, data);
+        let (kind, answered, reply) = self.reply(is_in);
+        assert_eq!((kind, answered), (3, sequence));
+        reply
+    }
+}
+
+struct Bench {
+    port: u16,
+    frames: Arc<Mutex<u32>>,
+    stop: Arc<std::sync::atomic::AtomicBool>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let frames = Arc::new(Mutex::new(0));
+        let description = Description {
+            vendor_id: 0x1209,
+            product_id: 0x5753,
+            product: "left camera".into(),
+            serial: "S1".into(),
+            width: WIDTH,
+            height: HEIGHT,
+            format: PixelFormat::Grey,
+            interval_100ns: 333_333,
+        };
+        let camera = UvcCamera::new(description, Counting { left: frames.clone() });
+        let function: Arc<Mutex<dyn UsbFunction>> = Arc::new(Mutex::new(camera));
+        let server = Server::new(vec![Export::new(function)]);
+        let stop = server.stop_flag();
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let thread = std::thread::spawn(move || server.listen(&listener, |_| {}).unwrap());
+        Self { port, frames, stop, thread: Some(thread) }
+    }
+}
+
+impl Drop for Bench {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().unwrap().join().unwrap();
+    }
+}
+
+const SET_CONFIGURATION: [u8; 8] = [0, 9, 1, 0, 0, 0, 0, 0];
+const COMMIT: [u8; 8] = [0x21, 1, 0, 2, 1, 0, 34, 0];
+
+#[test]
+fn devices_are_listed_and_lent_once() {
+    let bench = Bench::new();
+    let mut host = Host::connect(bench.port);
+    host.stream.write_all(&[1, 0x11, 0x80, 0x05, 0, 0, 0, 0]).unwrap();
+    let listing = host.bytes(12);
+    assert_eq!(listing[8..], [0, 0, 0, 1]);
+    let record = host.bytes(312 + 8);
+    assert_eq!(&record[256..260], b"1-1\0");
+    assert_eq!(record[300..304], [0x12, 0x09, 0x57, 0x53]);
+    assert_eq!(record[312..315], [0x0e, 1, 0]);
+
+    let mut first = Host::connect(bench.port);
+    assert!(first.import("1-1").is_some());
+    assert!(Host::connect(bench.port).import("1-1").is_none(), "lent twice");
+    assert!(Host::connect(bench.port).import("1-2").is_none(), "there is no second device");
+    drop(first);
+    for _ in 0..100 {
+        if Host::connect(bench.port).import("1-1").is_some() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    panic!("not given back after its host had gone");
+}
+
+#[test]
+fn a_frame_arrives_whole_and_settings_show_in_it() {
+    let bench = Bench::new();
+    let mut host = Host::connect(bench.port);
+    host.import("1-1").unwrap();
+    let (status, device) = host.control([0x80, 6, 0, 1, 0, 0, 18, 0], &[]);
+    assert_eq!((status, device.len(), device[8], device[10]), (0, 18, 0x09, 0x53));
+    assert_eq!(host.control(SET_CONFIGURATION, &[]).0, 0);
+    // Gain 3.00: processing unit 2, selector 4.
+    assert_eq!(host.control([0x21, 1, 0, 4, 0, 2, 2, 0], &[44, 1]).0, 0);
+    assert_eq!(host.control([0xa1, 0x81, 0, 4, 0, 2, 2, 0], &[]).1, [44, 1]);
+    // Out of range: refused, the setting stays.
+    assert_eq!(host.control([0x21, 1, 0, 4, 0, 2, 2, 0], &[0xff, 0xff]).0, -32);
+    assert_eq!(host.control([0xa1, 0x81, 0, 4, 0, 2, 2, 0], &[]).1, [44, 1]);
+    let (_, probe) = host.control([0xa1, 0x81, 0, 1, 1, 0, 34, 0], &[]);
+    let payload = u32::from_le_bytes(probe[22..26].try_into().unwrap()) as usize;
+    assert_eq!(payload, 12 + usize::from(WIDTH) * usize::from(HEIGHT));
+    assert_eq!(host.control(COMMIT, &probe).0, 0);
+
+    // Buffers as uvcvideo makes them: the payload ends with the first short one.
+    const BUFFER: usize = 1024;
+    let count = payload / BUFFER + 1;
+    for _ in 0..count {
+        host.send(true, 1, BUFFER, [0; 8], &[]);
+    }
+    *bench.frames.lock().unwrap() = 1;
+    let mut received = Vec::new();
+    for i in 0..count {
+        let (_, _, (status, data)) = host.reply(true);
+        assert_eq!(status, 0);
+        assert_eq!(data.len() < BUFFER, i == count - 1);
+        received.extend(data);
+    }
+    assert_eq!(received[0], 12);
+    assert_eq!(received[2..6], 48_000u32.to_le_bytes());
+    assert_eq!(received[10..12], [7, 0]);
+    assert_eq!(received.len(), payload);
+    assert!(received[12..].iter().enumerate().all(|(i, p)| *p == (300 + i) as u8));
+}
+
+#[test]
+fn a_waiting_transfer_can_be_given_up_and_blocks_nothing() {
+    let bench = Bench::new();
+    let mut host = Host::connect(bench.port);
+    host.import("1-1").unwrap();
+    host.control(SET_CONFIGURATION, &[]);
+    host.control(COMMIT, &[0; 34]);
+    let waiting = host.send(true, 1, 512, [0; 8], &[]);
+    // Nothing to send yet, but control transfers go on.
+    assert_eq!(host.control([0x80, 8, 0, 0, 0, 0, 1, 0], &[]), (0, vec![1]));
+    host.sequence += 1;
+    let mut unlink: Vec<u8> =
+        [2, host.sequence, 0, 0, 0, waiting].iter().flat_map(|f: &u32| f.to_be_bytes()).collect();
+    unlink.resize(48, 0);
+    host.stream.write_all(&unlink).unwrap();
+    let (kind, sequence, (status, _)) = host.reply(false);
+    assert_eq!((kind, sequence, status), (4, host.sequence, -104));
+    // An endpoint that is not there stalls.
+    let stalled = host.send(true, 3, 64, [0; 8], &[]);
+    assert_eq!(host.reply(true), (3, stalled, (-32, vec![])));
+}
+
+#[test]
+fn noise_instead_of_usbip_ends_the_connection_only() {
+    let bench = Bench::new();
+    let mut state = 1u32;
+    for _ in 0..20 {
+        let mut host = Host::connect(bench.port);
+        let noise: Vec<u8> = (0..200)
+            .map(|_| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 24) as u8
+            })
+            .collect();
+        let _ = host.stream.write_all(&noise);
+    }
+    assert!(Host::connect(bench.port).import("1-1").is_some());
+}
