@@ -9,7 +9,9 @@ pub mod calibration;
 pub mod export;
 pub mod frame;
 pub mod geometry;
+pub mod image_io;
 pub mod raw;
+pub mod recording;
 pub mod rectify;
 pub mod register;
 
@@ -22,6 +24,7 @@ pub use calibration::{CameraIntrinsics, StereoCalibration};
 pub use frame::{DepthFrame, PointCloud, SlotLabel};
 pub use geometry::RectifiedGeometry;
 pub use raw::RawImage;
+pub use recording::Recording;
 pub use rectify::{DepthRange, Rectifier};
 
 pub use uri::{SourceUri, UriError};
