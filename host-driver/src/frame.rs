@@ -1,5 +1,7 @@
 //! What the sensor delivers: depth frames and point clouds.
 
+use std::io;
+use std::path::Path;
 use std::sync::Arc;
 
 use nalgebra::Point3;
@@ -7,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use stspp_matcher::{Image, StageTime};
 
 use crate::RectifiedGeometry;
+use crate::export::{atomic, ply};
 
 /// What lit one camera frame and when, as reported by the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -70,20 +73,7 @@ impl DepthFrame {
 
     /// All valid pixels as points of the left camera's frame, row by row.
     pub fn point_cloud(&self) -> PointCloud {
-        let mut cloud = PointCloud::with_capacity(self.valid_points());
-        for y in 0..self.disparity_px.height() {
-            let (zncc, intensity) = (self.zncc.row(y), self.intensity.row(y));
-            for (x, &disparity_px) in self.disparity_px.row(y).iter().enumerate() {
-                if let Some(point) =
-                    self.geometry.point_left_m(x as f64, y as f64, f64::from(disparity_px))
-                {
-                    cloud.points_left_m.push(point.cast());
-                    cloud.zncc.push(zncc[x]);
-                    cloud.intensity.push(intensity[x]);
-                }
-            }
-        }
-        cloud
+        crate::reproject::point_cloud(self)
     }
 }
 
@@ -106,6 +96,22 @@ impl PointCloud {
             zncc: Vec::with_capacity(points),
             intensity: Vec::with_capacity(points),
         }
+    }
+
+    /// Writes a binary PLY file (see [`ply`]); it appears whole or not at all.
+    ///
+    /// # Errors
+    /// From the file system.
+    pub fn write_ply(&self, path: impl AsRef<Path>) -> io::Result<()> {
+        atomic::write_file(path.as_ref(), |out| ply::write(out, self))
+    }
+
+    /// Reads a PLY file, ours or another program's.
+    ///
+    /// # Errors
+    /// Names the header line or the point.
+    pub fn read_ply(path: impl AsRef<Path>) -> Result<Self, ply::PlyError> {
+        ply::read(&mut io::BufReader::new(std::fs::File::open(path)?))
     }
 
     /// Number of points.

@@ -6,14 +6,18 @@
 //! pixel is NaN.
 
 pub mod calibration;
+pub mod cpu_time;
 pub mod export;
 pub mod frame;
 pub mod geometry;
 pub mod image_io;
 pub mod raw;
+pub mod reconstruct;
 pub mod recording;
 pub mod rectify;
 pub mod register;
+pub mod report;
+pub mod reproject;
 
 // The live part: from sources to windows of pairs.
 pub mod clock;

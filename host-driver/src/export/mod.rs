@@ -4,4 +4,5 @@ pub mod atomic;
 pub mod colour;
 pub mod folder;
 pub mod images;
+pub mod outputs;
 pub mod ply;

@@ -28,6 +28,16 @@ impl Output {
         bar
     }
 
+    /// A spinner for work of unknown length; its message says what goes on.
+    pub fn spinner(&self) -> ProgressBar {
+        if self.quiet {
+            return ProgressBar::hidden();
+        }
+        let spinner = ProgressBar::new_spinner();
+        spinner.enable_steady_tick(Duration::from_millis(200));
+        spinner
+    }
+
     /// Prints a result: `text` for people, `json` for programs.
     pub fn result(&self, text: &str, json: &serde_json::Value) {
         if self.json {

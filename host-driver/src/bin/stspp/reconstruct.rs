@@ -1,24 +1,165 @@
 //! `stspp reconstruct`: depth from a recording folder.
+
 use std::path::PathBuf;
+
+use clap::ValueEnum;
+use stspp::export::{folder::OutputError, folder::OutputFolder, outputs};
+use stspp::reconstruct::{Options, ReconstructError};
+use stspp::rectify::{DepthRange, RectifyError};
+use stspp::{Recording, reconstruct, report};
+use stspp_matcher::{Method, ShapeFunction};
 
 use crate::exit::{Failure, Kind};
 use crate::output::Output;
 
 /// Compute depth image and point cloud of a recording folder.
+///
+/// The folder holds camchain.yaml (Kalibr), left/00.png ... and right/00.png ... (raw grey images of 8
+/// or 16 bits) and, if there is one, frames.json. Written are cloud.ply, disparity.tiff, depth.png,
+/// depth_color.png, zncc.png and report.json: all of them or, after an error, none.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Recording: camchain.yaml, left/00.png ..., right/00.png ...
+    /// Recording folder.
     folder: PathBuf,
+    /// Folder to write to; made if missing.
+    #[arg(long, short)]
+    out: PathBuf,
+    /// Replace outputs that are there.
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    matching: Matching,
+    /// First pair to use.
+    #[arg(long, default_value_t = 0)]
+    first: usize,
+}
+
+/// How frames are matched; shared by the verbs that match.
+#[derive(clap::Args, Clone)]
+pub struct Matching {
+    /// Sub-pixel method.
+    #[arg(long, value_enum, default_value_t)]
+    pub method: MethodName,
+    /// Order of the subset's shape function.
+    #[arg(long, value_enum, default_value_t)]
+    pub order: OrderName,
+    /// Frames to match, 1 to 16 [default: the recording's slots].
+    #[arg(long)]
+    pub frames: Option<usize>,
+    /// Nearest depth in metres.
+    #[arg(long, default_value_t = 0.8, value_name = "M")]
+    pub depth_min: f64,
+    /// Farthest depth in metres.
+    #[arg(long, default_value_t = 2.0, value_name = "M")]
+    pub depth_max: f64,
+    /// Threads to use [default: all cores].
+    #[arg(long)]
+    pub threads: Option<usize>,
+}
+
+/// Names of [`Method`].
+#[derive(ValueEnum, Clone, Copy, Default)]
+pub enum MethodName {
+    /// Parabola through the census costs, no refinement.
+    Parabola,
+    /// Per-point Gauss-Newton, as the paper does.
+    #[default]
+    Icgn,
+    /// Dense least squares with shared warps.
+    Dense,
+}
+
+/// Names of [`ShapeFunction`].
+#[derive(ValueEnum, Clone, Copy, Default)]
+pub enum OrderName {
+    /// First order: least noise on flat surfaces.
+    #[value(name = "1")]
+    First,
+    /// Second order: follows curvature.
+    #[default]
+    #[value(name = "2")]
+    Second,
+    /// The order that fits each pixel.
+    Auto,
+}
+
+impl Matching {
+    /// The library's options.
+    pub fn options(&self) -> Options {
+        Options {
+            depth: DepthRange { min_m: self.depth_min, max_m: self.depth_max },
+            method: match self.method {
+                MethodName::Parabola => Method::Parabola,
+                MethodName::Icgn => Method::IcGn,
+                MethodName::Dense => Method::Dense,
+            },
+            shape: match self.order {
+                OrderName::First => ShapeFunction::First,
+                OrderName::Second => ShapeFunction::Second,
+                OrderName::Auto => ShapeFunction::Auto,
+            },
+            frames: self.frames,
+            first: 0,
+            threads: self.threads,
+        }
+    }
+}
+
+/// An output failure with its remedy.
+pub fn output_failure(error: &OutputError) -> Failure {
+    let remedy = match error {
+        OutputError::Exists { .. } => "give another --out, or --force to replace it",
+        _ => "check the path, its permissions and the free space; nothing was left behind",
+    };
+    Failure::new(Kind::Output, error).remedy(remedy)
+}
+
+/// A reconstruction failure with its remedy.
+pub fn reconstruct_failure(error: &ReconstructError) -> Failure {
+    let remedy = match error {
+        ReconstructError::Rectify(RectifyError::DepthRange { .. }) => {
+            "see --depth-min, --depth-max"
+        }
+        ReconstructError::Rectify(_) => "check camchain.yaml and the depth range",
+        ReconstructError::Match(_) => "see --method, --order, --threads",
+        ReconstructError::Window { .. } => "see --frames and --first",
+        _ => {
+            "a recording is camchain.yaml, left/00.png ..., right/00.png ... of equal number and size"
+        }
+    };
+    Failure::new(Kind::Input, error).remedy(remedy)
 }
 
 /// Runs the verb.
-pub fn run(args: &Args, _output: &Output) -> Result<(), Failure> {
-    if !args.folder.is_dir() {
-        return Err(Failure::new(
-            Kind::Input,
-            format!("{}: no such folder", args.folder.display()),
-        )
-        .remedy("give a recording folder"));
-    }
-    Err(Failure::new(Kind::Other, "reconstruct is not in this build"))
+pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
+    let recording = Recording::open(&args.folder)
+        .map_err(|e| reconstruct_failure(&ReconstructError::Recording(e)))?;
+    let mut out = OutputFolder::create(&args.out, args.force).map_err(|e| output_failure(&e))?;
+    let progress = output.spinner();
+    let options = Options { first: args.first, ..args.matching.options() };
+    let result =
+        reconstruct::reconstruct(&recording, &options, &mut |what| progress.set_message(what))
+            .map_err(|e| reconstruct_failure(&e))?;
+    let source = args.folder.display().to_string();
+    let report = report::of_reconstruction(&source, &result);
+    outputs::write(&mut out, &result.frame, &report, &mut |file| progress.set_message(file))
+        .and_then(|()| out.commit())
+        .map_err(|e| output_failure(&e))?;
+    progress.finish_and_clear();
+    let summary = report::Summary::of(&result.frame, result.seen_pixels);
+    let total_ms: f64 = result.steps.iter().map(|step| step.wall_ms).sum();
+    let text = format!(
+        "{} points ({:.1} % of what the left camera saw) from {} pairs in {:.2} s\n\
+         depth {} m (median), ZNCC {} (median)\n\
+         look at {}",
+        summary.points,
+        100.0 * summary.completeness,
+        result.pairs.len(),
+        total_ms / 1e3,
+        summary.depth_median_m.map_or("none".into(), |z| format!("{z:.4}")),
+        summary.zncc_median.map_or("none".into(), |v| format!("{v:.4}")),
+        args.out.join("depth_color.png").display(),
+    );
+    output.result(&text, &report);
+    Ok(())
 }
