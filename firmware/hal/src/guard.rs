@@ -1,0 +1,135 @@
+//! A one-shot that ends light whatever else the chip does: TIMER0 and a DMA channel write a fixed
+//! word to a port when the time is over (user manual, "Advanced timer (TIMERx, x=0)"; TIMER0_UP
+//! requests DMA channel 4).
+//!
+//! It is independent of what it guards: another timer, another DMA channel, no table, no CPU. It
+//! also interrupts, so that the software learns of it.
+
+use crate::calc::timing;
+use crate::dma::{self, Control};
+use crate::gpio::Output;
+use crate::interrupt::typelevel::{self, Handler};
+use crate::interrupt::{Interrupt, InterruptExt, Priority};
+use crate::peripherals::{DMA_CH4, TIMER0};
+use crate::regs::{self, RegExt};
+use crate::Peri;
+use core::cell::UnsafeCell;
+use core::sync::atomic::{AtomicBool, Ordering};
+
+const CHANNEL: u8 = 4;
+// TIMERx_CTL0.
+const CEN: u32 = 1 << 0;
+const UPS: u32 = 1 << 2;
+const SPM: u32 = 1 << 3;
+// TIMERx_DMAINTEN.
+const UP_INTERRUPT: u32 = 1 << 0;
+const UP_DMA: u32 = 1 << 8;
+
+struct Word(UnsafeCell<u32>);
+// SAFETY: written once before the channel starts, then read by DMA only.
+unsafe impl Sync for Word {}
+static OFF_WORD: Word = Word(UnsafeCell::new(0));
+static TRIPPED: AtomicBool = AtomicBool::new(false);
+
+/// Longest guarded time in microseconds (16-bit counter at 1 MHz).
+pub const MAX_US: u32 = 65_536;
+
+/// The driver. Arming is by free functions, because the interrupt that sees the edges does it.
+pub struct Guard<'d> {
+    _timer: Peri<'d, TIMER0>,
+    _channel: Peri<'d, DMA_CH4>,
+}
+
+impl<'d> Guard<'d> {
+    /// Prepares the one-shot: `limit_us` after [`arm`], `off_word` is written to the port of `pin`.
+    ///
+    /// # Panics
+    /// When `limit_us` is 0 or more than [`MAX_US`].
+    pub fn new(
+        timer: Peri<'d, TIMER0>,
+        channel: Peri<'d, DMA_CH4>,
+        pin: &Output<'_>,
+        off_word: u32,
+        limit_us: u32,
+        priority: Priority,
+        _irq: impl typelevel::Binding<typelevel::TIMER0_BRK_UP_TRG_COM, InterruptHandler>,
+    ) -> Self {
+        assert!(limit_us > 0 && limit_us <= MAX_US, "guard limit");
+        let Some(prescaler) = timing::prescaler(crate::rcu::clocks().timer_hz, 1_000_000) else {
+            panic!("the timer clock is no whole number of megahertz")
+        };
+        let rcu = regs::rcu();
+        rcu.apb2en.modify(|_, w| w.timer0en().set_bit());
+        rcu.apb2rst.modify(|_, w| w.timer0rst().set_bit());
+        rcu.apb2rst.modify(|_, w| w.timer0rst().clear_bit());
+        // SAFETY: the channel has not been started yet.
+        unsafe { OFF_WORD.0.get().write(off_word) };
+
+        let timer_regs = regs::timer0();
+        timer_regs.psc.set(u32::from(prescaler));
+        timer_regs.car.set(limit_us - 1);
+        timer_regs.ctl0.set(UPS | SPM);
+        timer_regs.swevg.write(|w| w.upg().set_bit());
+        timer_regs.intf.set(0);
+        // Circular over one word without increment: it serves every overflow, for ever.
+        dma::start(
+            CHANNEL,
+            Control::new(Control::TO_PERIPHERAL | Control::CIRCULAR | Control::WORDS | Control::ULTRA),
+            regs::gpio(pin.identity().0).bop.as_ptr(),
+            OFF_WORD.0.get().cast(),
+            1,
+        );
+        timer_regs.dmainten.set(UP_INTERRUPT | UP_DMA);
+        Interrupt::TIMER0_BRK_UP_TRG_COM.set_priority(priority);
+        // SAFETY: bound, by the constructor's parameter.
+        unsafe { Interrupt::TIMER0_BRK_UP_TRG_COM.enable() };
+        Self { _timer: timer, _channel: channel }
+    }
+}
+
+/// Starts the time anew.
+#[inline(always)]
+pub fn arm() {
+    let timer = regs::timer0();
+    timer.ctl0.set(UPS | SPM);
+    timer.cnt.set(0);
+    timer.ctl0.set(UPS | SPM | CEN);
+}
+
+/// Starts the time if it is not running.
+#[inline(always)]
+pub fn arm_if_idle() {
+    if regs::timer0().ctl0.get() & CEN == 0 {
+        arm();
+    }
+}
+
+/// Stops it: there is nothing to guard.
+#[inline(always)]
+pub fn disarm() {
+    regs::timer0().ctl0.set(UPS | SPM);
+}
+
+/// Whether it has ended something since the last call.
+pub fn take_tripped() -> bool {
+    // A plain swap: load and store are enough, one context asks.
+    let tripped = TRIPPED.load(Ordering::Acquire);
+    if tripped {
+        TRIPPED.store(false, Ordering::Release);
+    }
+    tripped
+}
+
+/// Handler of TIMER0's update interrupt. The port is off already when it runs.
+pub struct InterruptHandler;
+
+impl Handler<typelevel::TIMER0_BRK_UP_TRG_COM> for InterruptHandler {
+    unsafe fn on_interrupt() {
+        let timer = regs::timer0();
+        if timer.intf.get() & 1 != 0 {
+            timer.intf.set(!1);
+            crate::sequence::halt();
+            TRIPPED.store(true, Ordering::Release);
+        }
+    }
+}
