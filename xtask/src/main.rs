@@ -2,6 +2,7 @@
 
 mod arrows;
 mod debian;
+mod firmware;
 mod licences;
 mod stage;
 mod test;
@@ -14,6 +15,9 @@ cargo xtask test [--quick]   everything that is proven: formatting, lints, depen
                              licences, tests. --quick leaves out the stages that need Debian packages
 cargo xtask arrows           check which crate may depend on which
 cargo xtask licences         check the licences of everything that ships against deny.toml
+cargo xtask firmware [f330] [f350] [--install] [--test]
+                             builds the firmware, prints flash and RAM, fails over budget;
+                             --install gets the compiler's target, --test runs its host tests
 cargo xtask help             this text";
 
 fn main() -> ExitCode {
@@ -24,6 +28,7 @@ fn main() -> ExitCode {
         ["test", "--quick"] => return test::run(test::Depth::Quick),
         ["arrows"] => workspace::metadata().and_then(|m| arrows::check(&m)),
         ["licences"] => workspace::metadata().and_then(|m| licences::check(&m)),
+        ["firmware", rest @ ..] => firmware::run(rest),
         ["help" | "--help" | "-h"] | [] => {
             println!("{HELP}");
             Ok(String::new())

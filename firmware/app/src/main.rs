@@ -37,7 +37,14 @@ async fn main(spawner: Spawner) {
     let mut config = usart::Config::default();
     config.baud = 2_000_000;
     let (mut tx, mut rx) = usart::new(
-        p.USART0, p.PA9, p.PA10, p.DMA_CH1, p.DMA_CH2, RING.init([0; 256]), Irqs, config,
+        p.USART0,
+        p.PA9,
+        p.PA10,
+        p.DMA_CH1,
+        p.DMA_CH2,
+        RING.init([0; 256]),
+        Irqs,
+        config,
     )
     .unwrap();
     let mut buffer = [0; 64];

@@ -66,7 +66,10 @@ pub struct Adc<'d> {
 
 impl<'d> Adc<'d> {
     /// Clocks, switches on and calibrates it (about 0.1 ms).
-    pub fn new(adc: Peri<'d, ADC>, _irq: impl Binding<typelevel::ADC_CMP, InterruptHandler>) -> Self {
+    pub fn new(
+        adc: Peri<'d, ADC>,
+        _irq: impl Binding<typelevel::ADC_CMP, InterruptHandler>,
+    ) -> Self {
         let rcu = regs::rcu();
         rcu.apb2en.modify(|_, w| w.adcen().set_bit());
         // Clock = APB2 / 2: 21 or 24 MHz, below the 28 MHz of the data sheet (RCU_CFG2 ADCSEL,

@@ -83,7 +83,13 @@ fn irq_of(channel: u8) -> Interrupt {
 }
 
 /// Sets a channel up and starts it.
-pub(crate) fn start(channel: u8, control: Control, peripheral: *mut u32, memory: *const u8, count: u16) {
+pub(crate) fn start(
+    channel: u8,
+    control: Control,
+    peripheral: *mut u32,
+    memory: *const u8,
+    count: u16,
+) {
     stop(channel);
     // What the CPU wrote to the buffer must be in memory before the channel reads it.
     fence(Ordering::SeqCst);
@@ -94,7 +100,9 @@ pub(crate) fn start(channel: u8, control: Control, peripheral: *mut u32, memory:
     regs.paddr.set(peripheral as u32);
     regs.maddr.set(memory as u32);
     regs.cnt.set(u32::from(count));
-    if control.0 & (Control::FULL_INTERRUPT | Control::HALF_INTERRUPT | Control::ERROR_INTERRUPT) != 0 {
+    if control.0 & (Control::FULL_INTERRUPT | Control::HALF_INTERRUPT | Control::ERROR_INTERRUPT)
+        != 0
+    {
         // SAFETY: drivers demand the binding of the channel's interrupt.
         unsafe { irq_of(channel).enable() };
     }
@@ -140,7 +148,11 @@ pub(crate) struct Transfer<'d> {
 
 impl<'d> Transfer<'d> {
     /// Moves bytes to a peripheral register.
-    pub(crate) fn write<C: Channel>(_channel: &mut Peri<'_, C>, buffer: &'d [u8], register: *mut u32) -> Self {
+    pub(crate) fn write<C: Channel>(
+        _channel: &mut Peri<'_, C>,
+        buffer: &'d [u8],
+        register: *mut u32,
+    ) -> Self {
         let control = Control::new(
             Control::TO_PERIPHERAL
                 | Control::MEMORY_INCREMENT

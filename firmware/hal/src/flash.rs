@@ -9,7 +9,9 @@ use crate::Peri;
 use crate::chip::{FLASH_BYTES, FLASH_PAGE_BYTES};
 use crate::peripherals::FMC;
 use crate::regs::{self, RegExt};
-use embedded_storage::nor_flash::{ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash};
+use embedded_storage::nor_flash::{
+    ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
+};
 
 const BASE: u32 = 0x0800_0000;
 const UNLOCK: [u32; 2] = [0x4567_0123, 0xcdef_89ab];

@@ -5,6 +5,7 @@
 //! It is independent of what it guards: another timer, another DMA channel, no table, no CPU. It
 //! also interrupts, so that the software learns of it.
 
+use crate::Peri;
 use crate::calc::timing;
 use crate::dma::{self, Control};
 use crate::gpio::Output;
@@ -12,7 +13,6 @@ use crate::interrupt::typelevel::{self, Handler};
 use crate::interrupt::{Interrupt, InterruptExt, Priority};
 use crate::peripherals::{DMA_CH4, TIMER0};
 use crate::regs::{self, RegExt};
-use crate::Peri;
 use core::cell::UnsafeCell;
 use core::sync::atomic::{AtomicBool, Ordering};
 
@@ -74,7 +74,9 @@ impl<'d> Guard<'d> {
         // Circular over one word without increment: it serves every overflow, for ever.
         dma::start(
             CHANNEL,
-            Control::new(Control::TO_PERIPHERAL | Control::CIRCULAR | Control::WORDS | Control::ULTRA),
+            Control::new(
+                Control::TO_PERIPHERAL | Control::CIRCULAR | Control::WORDS | Control::ULTRA,
+            ),
             regs::gpio(pin.identity().0).bop.as_ptr(),
             OFF_WORD.0.get().cast(),
             1,

@@ -50,9 +50,9 @@ pub mod sequence;
 pub mod time_driver;
 #[cfg(target_os = "none")]
 pub mod timer;
-#[cfg(all(target_os = "none", feature = "gd32f350"))]
-pub mod usb;
 #[cfg(target_os = "none")]
 pub mod usart;
+#[cfg(all(target_os = "none", feature = "gd32f350"))]
+pub mod usb;
 #[cfg(target_os = "none")]
 pub mod watchdog;

@@ -129,12 +129,7 @@ pub(crate) fn timer(number: u8) -> &'static pac::timer0::RegisterBlock {
 /// TIMERx_CHCTL0 or 1 of a timer: the PAC has them only as unions of input and output mode, under
 /// names that differ by timer; the access is the same 32-bit one as to CTL0.
 #[inline(always)]
-pub(crate) fn timer_chctl(
-    number: u8,
-    index: u8,
-) -> &'static Reg<pac::timer0::ctl0::CTL0_SPEC> {
+pub(crate) fn timer_chctl(number: u8, index: u8) -> &'static Reg<pac::timer0::ctl0::CTL0_SPEC> {
     // SAFETY: CHCTL0 at 0x18, CHCTL1 at 0x1C of the timer's block; plain read/write registers.
-    unsafe {
-        &*core::ptr::from_ref(timer(number)).byte_add(0x18 + 4 * index as usize).cast()
-    }
+    unsafe { &*core::ptr::from_ref(timer(number)).byte_add(0x18 + 4 * index as usize).cast() }
 }

@@ -114,7 +114,8 @@ impl<'d> Sequence<'d> {
             RINGS.words.get().write([0; RING]);
         }
         timer.dmacfg.set(BURST_CH2CV_CH3CV);
-        let common = Control::TO_PERIPHERAL | Control::CIRCULAR | Control::MEMORY_INCREMENT | Control::WORDS;
+        let common =
+            Control::TO_PERIPHERAL | Control::CIRCULAR | Control::MEMORY_INCREMENT | Control::WORDS;
         dma::start(
             PORT_CHANNEL,
             Control::new(common | Control::ULTRA),

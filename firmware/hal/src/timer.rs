@@ -83,7 +83,11 @@ impl<'d, T: Instance, const CHANNEL: u8> Pwm<'d, T, CHANNEL> {
     ///
     /// # Panics
     /// When the timer cannot make the frequency.
-    pub fn new<P: OutputPin<T, CHANNEL>>(timer: Peri<'d, T>, pin: Peri<'d, P>, frequency_hz: u32) -> Self {
+    pub fn new<P: OutputPin<T, CHANNEL>>(
+        timer: Peri<'d, T>,
+        pin: Peri<'d, P>,
+        frequency_hz: u32,
+    ) -> Self {
         T::enable_clock();
         let Some((prescaler, reload)) = timing::pwm(crate::rcu::clocks().timer_hz, frequency_hz)
         else {

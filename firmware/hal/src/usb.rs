@@ -12,10 +12,10 @@ use embassy_usb_driver::{
     Bus as BusTrait, EndpointAddress, EndpointAllocError, EndpointType, Event, Unsupported,
 };
 use embassy_usb_synopsys_otg::otg_v1::Otg;
-pub use embassy_usb_synopsys_otg::{Config, ControlPipe, Endpoint, In, Out};
 use embassy_usb_synopsys_otg::{
     Bus as OtgBus, Driver as OtgDriver, OtgInstance, PhyType, StateStorage, on_interrupt,
 };
+pub use embassy_usb_synopsys_otg::{Config, ControlPipe, Endpoint, In, Out};
 
 /// USBFS's base address (memory map).
 const BASE: *mut () = 0x5000_0000 as *mut ();

@@ -148,7 +148,14 @@ mod tests {
         fn new(now: u32) -> Self {
             // Stale cells look like events of the past lap.
             let past = now.wrapping_sub(5);
-            Self { now, compare: past, words: [0xdead; RING], times: [past; RING], cell: 0, port: vec![] }
+            Self {
+                now,
+                compare: past,
+                words: [0xdead; RING],
+                times: [past; RING],
+                cell: 0,
+                port: vec![],
+            }
         }
 
         fn tick(&mut self) {

@@ -181,7 +181,10 @@ mod tests {
             Err(ClockError::Unreachable),
             "4 MHz steps only"
         );
-        assert_eq!(Pll::solve(PllInput::Hxtal { hz: 40_000_000 }, 7_000_000), Err(ClockError::Unreachable));
+        assert_eq!(
+            Pll::solve(PllInput::Hxtal { hz: 40_000_000 }, 7_000_000),
+            Err(ClockError::Unreachable)
+        );
         assert_eq!(usb_prescaler_bits(84_000_000), Err(ClockError::No48MHz));
     }
 
