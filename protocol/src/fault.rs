@@ -32,11 +32,13 @@ pub enum FaultReason {
     Panic = 9,
     /// The processor faulted.
     HardFault = 10,
+    /// A debugger halted the processor while armed or running.
+    DebugHalt = 11,
 }
 
 impl FaultReason {
     /// All reasons, in bit order.
-    pub const ALL: [FaultReason; 11] = [
+    pub const ALL: [FaultReason; 12] = [
         FaultReason::Interlock,
         FaultReason::HeartbeatLost,
         FaultReason::OverTemperature,
@@ -48,6 +50,7 @@ impl FaultReason {
         FaultReason::Watchdog,
         FaultReason::Panic,
         FaultReason::HardFault,
+        FaultReason::DebugHalt,
     ];
 
     /// What happened, in words.
@@ -65,6 +68,7 @@ impl FaultReason {
             FaultReason::Watchdog => "watchdog reset",
             FaultReason::Panic => "firmware panic",
             FaultReason::HardFault => "processor fault",
+            FaultReason::DebugHalt => "halted by a debugger",
         }
     }
 }

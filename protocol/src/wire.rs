@@ -241,6 +241,9 @@ impl FrameDecoder {
 fn open(encoded: &mut [u8]) -> Result<Frame<'_>, FrameError> {
     let len = cobs::decode_in_place(encoded).map_err(|_| FrameError::Encoding)?;
     let packet = encoded.get(..len).ok_or(FrameError::Encoding)?;
+    if packet.len() < HEADER_LEN + CRC_LEN {
+        return Err(FrameError::Encoding);
+    }
     let (content, crc) = packet.split_last_chunk::<CRC_LEN>().ok_or(FrameError::Encoding)?;
     if packet_crc(content) != u16::from_le_bytes(*crc) {
         return Err(FrameError::Crc);
