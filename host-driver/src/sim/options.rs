@@ -1,0 +1,150 @@
+//! What may follow `sim:`.
+
+use stspp_hil_sim::world::{SceneSpec, SensorModel, list_scenes};
+
+use crate::{Error, UriError};
+
+/// Scene when none is named: the paper's Figure 2.
+pub const DEFAULT_SCENE: &str = "sphere";
+
+/// Options of the sensor; a scene has its own besides.
+const KNOWN: &str = "seed, scale, bits, pace, rig, and the scene's own (stspp list --scenes)";
+
+/// How fast simulated time passes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Pace {
+    /// As fast as frames are consumed: nothing is ever too slow, and nothing is dropped.
+    #[default]
+    Fast,
+    /// As fast as wall time, so that a slow consumer loses frames as it would with hardware.
+    Real,
+}
+
+/// A simulated sensor.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SimOptions {
+    /// What stands before it.
+    pub scene: SceneSpec,
+    /// Name of the scene.
+    pub scene_name: String,
+    /// Seed of dot layouts, tolerances and noise.
+    pub seed: u64,
+    /// The cameras have 1/scale of the pixels in each direction.
+    pub scale: usize,
+    /// Bits of a pixel: 8, 10 or 12.
+    pub bits: u8,
+    /// How fast time passes.
+    pub pace: Pace,
+    /// Another rig, with perturbed optics and poses, for each seed.
+    pub rig_seed: Option<u64>,
+}
+
+impl SimOptions {
+    /// The default sensor before `scene` (the default scene when `None`), with options as (name,
+    /// value) pairs.
+    ///
+    /// # Errors
+    /// An unknown scene or option, or a value that it does not take.
+    pub fn parse(scene: Option<&str>, options: &[(String, String)]) -> Result<Self, Error> {
+        let scene_name = scene.unwrap_or(DEFAULT_SCENE);
+        let mut seed = 1;
+        let mut scale = 1;
+        let mut bits = 8;
+        let mut pace = Pace::default();
+        let mut rig_seed = None;
+        let mut of_scene = Vec::new();
+        for (name, value) in options {
+            let wrong = |expected: &str| UriError::OptionValue {
+                name: name.clone(),
+                value: value.clone(),
+                expected: expected.to_owned(),
+            };
+            let number = |expected| value.parse::<u64>().map_err(|_| wrong(expected));
+            match name.as_str() {
+                "seed" => seed = number("a whole number")?,
+                "rig" if value == "default" => rig_seed = None,
+                "rig" => rig_seed = Some(number("default or a whole number")?),
+                "scale" => {
+                    let expected = "1, 2, 4, 8 or 16";
+                    scale = match number(expected)? {
+                        scale @ (1 | 2 | 4 | 8 | 16) => scale as usize,
+                        _ => return Err(wrong(expected).into()),
+                    };
+                }
+                "bits" => {
+                    bits = match value.as_str() {
+                        "8" => 8,
+                        "10" => 10,
+                        "12" => 12,
+                        _ => return Err(wrong("8, 10 or 12").into()),
+                    };
+                }
+                "pace" => {
+                    pace = match value.as_str() {
+                        "fast" => Pace::Fast,
+                        "real" => Pace::Real,
+                        _ => return Err(wrong("fast or real").into()),
+                    };
+                }
+                _ => of_scene.push((name.as_str(), value.as_str())),
+            }
+        }
+        let known = list_scenes().iter().find(|s| s.name == scene_name);
+        let unknown = of_scene
+            .iter()
+            .find(|(name, _)| known.is_some_and(|s| !s.options.iter().any(|o| o.name == *name)));
+        if let Some((name, _)) = unknown {
+            let name = (*name).to_owned();
+            return Err(UriError::OptionUnknown { scheme: "sim", name, known: KNOWN }.into());
+        }
+        let scene = SceneSpec::parse(scene_name, &of_scene)
+            .map_err(|error| Error::Simulation(error.to_string()))?;
+        let scene_name = scene_name.to_owned();
+        Ok(Self { scene, scene_name, seed, scale, bits, pace, rig_seed })
+    }
+
+    /// The sensor's optics and electronics.
+    pub fn model(&self) -> SensorModel {
+        let model = match self.rig_seed {
+            Some(seed) => SensorModel::perturbed(seed),
+            None => SensorModel::with_seed(self.seed),
+        };
+        let model = model.with_bits(self.bits);
+        if self.scale > 1 { model.scaled_down(self.scale) } else { model }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::SourceUri;
+
+    fn parse(uri: &str) -> Result<SimOptions, String> {
+        match uri.parse::<SourceUri>().unwrap() {
+            SourceUri::Sim { scene, options } => {
+                SimOptions::parse(scene.as_deref(), &options).map_err(|error| error.to_string())
+            }
+            _ => unreachable!(),
+        }
+    }
+
+    #[test]
+    fn options_of_sensor_and_scene_are_told_apart() {
+        let options = parse("sim:plane?distance_m=1.5&seed=7&scale=4&bits=10&pace=real").unwrap();
+        assert_eq!((options.seed, options.scale, options.bits), (7, 4, 10));
+        assert_eq!(options.pace, Pace::Real);
+        assert_eq!(options.scene.distance_m, 1.5);
+        assert_eq!(options.model().left.width, 320);
+        assert_eq!(parse("sim:").unwrap().scene_name, DEFAULT_SCENE);
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        assert!(parse("sim:nowhere").unwrap_err().contains("nowhere"));
+        assert!(parse("sim:plane?colour=red").unwrap_err().contains("colour"));
+        assert!(parse("sim:plane?scale=3").unwrap_err().contains("1, 2, 4, 8 or 16"));
+        assert!(parse("sim:plane?bits=9").unwrap_err().contains("8, 10 or 12"));
+        assert!(parse("sim:plane?pace=slow").unwrap_err().contains("fast or real"));
+        assert!(parse("sim:plane?distance_m=far").unwrap_err().contains("distance_m"));
+    }
+}
