@@ -94,9 +94,17 @@ pub enum Error {
         /// Why.
         source: std::io::Error,
     },
-    /// A thread of the stream panicked: a bug.
-    #[error("the {0} thread of the stream panicked; this is a bug in stspp")]
-    Panicked(&'static str),
+    /// A thread of the stream could not be started, or panicked.
+    #[error("the {thread} thread of the stream: {what}")]
+    Thread {
+        /// The thread.
+        thread: &'static str,
+        /// What happened.
+        what: String,
+    },
+    /// The stream has ended.
+    #[error("the stream has ended; open another one")]
+    Stopped,
 }
 
 /// What did not come in time.

@@ -19,9 +19,17 @@ pub mod register;
 pub mod report;
 pub mod reproject;
 
-// The live part: from sources to windows of pairs.
+// The live part: from sources to depth frames.
+pub mod camera;
 pub mod clock;
+pub mod error;
+pub mod pipeline;
+pub mod sensor;
+#[cfg(feature = "sim")]
+pub mod sim;
 pub mod sync;
+pub mod timing;
+pub mod transport;
 pub mod uri;
 
 pub use calibration::{CameraIntrinsics, StereoCalibration};
@@ -31,4 +39,8 @@ pub use raw::RawImage;
 pub use recording::Recording;
 pub use rectify::{DepthRange, Rectifier};
 
+pub use error::Error;
+pub use pipeline::{DepthStream, LabelledPair, PairStream, StreamOptions, StreamStats};
+pub use sensor::{Sensor, SensorInfo};
+pub use stspp_protocol::timing::{ProjectionTiming, Slot};
 pub use uri::{SourceUri, UriError};

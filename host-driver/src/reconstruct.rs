@@ -217,7 +217,7 @@ pub fn reconstruct(
 }
 
 /// Exposure centres, when the labels hold times at all.
-fn times_s(labels: &[SlotLabel]) -> Option<Vec<f64>> {
+pub(crate) fn times_s(labels: &[SlotLabel]) -> Option<Vec<f64>> {
     let times: Vec<f64> = labels.iter().map(SlotLabel::exposure_centre_s).collect();
     times.windows(2).all(|t| t[1] > t[0]).then_some(times).filter(|t| t.len() > 1)
 }

@@ -84,6 +84,7 @@ impl Link {
                 trigger_time_us: device_ns / 1000,
                 exposure_us: (self.exposure_ns / 1000) as u32,
             },
+            timing_generation: 0,
             arrival_host_ns: 3_000_000_000
                 + device_ns
                 + self.exposure_ns

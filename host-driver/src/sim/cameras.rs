@@ -6,9 +6,9 @@ use std::time::Duration;
 use stspp_hil_sim::world::{Camera, World};
 use stspp_matcher::Image;
 
+use super::Rig;
 use super::options::Pace;
 use super::rig::Exposure;
-use super::Rig;
 use crate::RawImage;
 use crate::camera::{CameraError, CameraFrame, CameraSource, fingerprint};
 use crate::sync::{FrameStamp, Side};

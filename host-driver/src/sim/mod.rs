@@ -80,6 +80,19 @@ impl SimSensor {
     }
 }
 
+impl SimSensor {
+    /// The parts as [`Sensor::from_parts`](crate::Sensor::from_parts) takes them.
+    pub fn into_parts(self, source: crate::SourceUri) -> crate::sensor::Parts {
+        crate::sensor::Parts {
+            source,
+            transport: Box::new(self.link),
+            cameras: Box::new(self.cameras),
+            clock: self.clock,
+            calibration: self.calibration,
+        }
+    }
+}
+
 /// The calibration of a sensor model.
 pub fn calibration_of(model: &SensorModel) -> StereoCalibration {
     let camera = |camera: &CameraModel| CameraIntrinsics {

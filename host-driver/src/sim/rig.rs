@@ -71,8 +71,7 @@ pub fn readout_ns(pixels: usize) -> u64 {
 impl Rig {
     /// Joins `controller` to two cameras with the given read-out time.
     pub fn new(controller: Box<dyn Controller>, pace: Pace, readout_ns: u64) -> Self {
-        let wall =
-            (pace == Pace::Real).then(|| (Arc::new(MonotonicClock::new()), Instant::now()));
+        let wall = (pace == Pace::Real).then(|| (Arc::new(MonotonicClock::new()), Instant::now()));
         Self {
             controller,
             clock: Arc::new(VirtualClock::new()),
@@ -239,8 +238,11 @@ impl Rig {
             return;
         }
         camera.last_close_ns = Some(close_ns);
-        let still_on =
-            self.on.iter().map(|&(source, on_ns)| LightInterval { source, on_ns, off_ns: close_ns });
+        let still_on = self.on.iter().map(|&(source, on_ns)| LightInterval {
+            source,
+            on_ns,
+            off_ns: close_ns,
+        });
         let lights = self
             .past
             .iter()

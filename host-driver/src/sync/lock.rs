@@ -145,6 +145,7 @@ mod tests {
                 trigger_time_us: time_ns / 1000,
                 exposure_us: 32_000,
             },
+            timing_generation: 0,
             arrival_host_ns: time_ns - 4_000_000_000 + 32_000_000 + 700_000,
         }
     }

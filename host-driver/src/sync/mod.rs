@@ -68,6 +68,8 @@ pub struct FrameStamp {
 pub struct Trigger {
     /// What the device said of it.
     pub label: crate::SlotLabel,
+    /// Generation of the timing that lit the exposure.
+    pub timing_generation: u16,
     /// When the event reached the host, in nanoseconds of the host's clock.
     pub arrival_host_ns: u64,
 }

@@ -43,6 +43,7 @@ pub enum Step {
 #[derive(Debug, Clone)]
 pub struct Window<P> {
     slots: Vec<SlotLight>,
+    used: Vec<bool>,
     length: usize,
     pairs: VecDeque<(SlotLabel, P)>,
     last: Option<SlotLabel>,
@@ -52,8 +53,14 @@ impl<P> Window<P> {
     /// A window of `length` speckle pairs over the cycle `slots`. `length` is limited to the speckle
     /// slots of a cycle, so that no slot is in it twice.
     pub fn new(slots: Vec<SlotLight>, length: usize) -> Self {
-        let speckle = slots.iter().filter(|slot| slot.is_speckle()).count();
-        Self { slots, length: length.min(speckle), pairs: VecDeque::new(), last: None }
+        let used = slots.iter().map(|slot| slot.is_speckle()).collect();
+        Self::with_used(slots, used, length)
+    }
+
+    /// As [`Window::new`], where `used` says which slots are matched.
+    pub fn with_used(slots: Vec<SlotLight>, used: Vec<bool>, length: usize) -> Self {
+        let length = length.min(used.iter().filter(|used| **used).count());
+        Self { slots, used, length, pairs: VecDeque::new(), last: None }
     }
 
     /// Number of pairs of a complete window; 0 when the timing has no speckle slot.
@@ -89,7 +96,7 @@ impl<P> Window<P> {
             let cycle = self.slots.len() as u64;
             let ahead = u64::from(label.sequence).wrapping_sub(u64::from(last.sequence));
             let forward = label.sequence > last.sequence
-                && label.trigger_time_us > last.trigger_time_us
+                && label.trigger_time_us >= last.trigger_time_us
                 && (u64::from(last.slot) + ahead) % cycle == u64::from(label.slot);
             if !forward {
                 return Step::Mislabelled;
@@ -98,7 +105,7 @@ impl<P> Window<P> {
                 return Step::Gap { dropped: self.pairs.len() };
             }
         }
-        match slot.is_speckle() {
+        match self.used.get(usize::from(label.slot)).copied().unwrap_or(false) {
             false => Step::NotSpeckle,
             true if self.pairs.len() + 1 >= self.length => Step::Complete,
             true => Step::Filling,
@@ -121,7 +128,7 @@ impl<P> Window<P> {
             Step::Complete | Step::Filling => {}
         }
         self.last = Some(label);
-        if !self.slots[usize::from(label.slot)].is_speckle() || self.length == 0 {
+        if !self.used[usize::from(label.slot)] || self.length == 0 {
             return step;
         }
         if self.pairs.len() == self.length {

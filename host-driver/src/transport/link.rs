@@ -302,9 +302,10 @@ impl Link {
     }
 
     fn handle_heartbeat_reply(&mut self, frame: &Frame<'_>, now_ns: u64) {
-        let in_flight = self.heartbeat.as_mut().and_then(|plan| {
-            plan.in_flight.take_if(|(seq, _)| *seq == frame.seq)
-        });
+        let in_flight = self
+            .heartbeat
+            .as_mut()
+            .and_then(|plan| plan.in_flight.take_if(|(seq, _)| *seq == frame.seq));
         let alive = frame.body_as::<Alive>().ok().filter(|_| frame.id == Heartbeat::ID | REPLY_BIT);
         match (in_flight, alive) {
             (Some((_, sent_ns)), Some(alive)) => {
