@@ -5,12 +5,15 @@
 //! origin at the centre of the unrectified camera 0), transforms are named `a_from_b`, an invalid
 //! pixel is NaN.
 
+#[cfg(feature = "sim")]
+pub mod accuracy;
 pub mod calibration;
 pub mod cpu_time;
 pub mod export;
 pub mod frame;
 pub mod geometry;
 pub mod image_io;
+pub mod measure;
 pub mod raw;
 pub mod reconstruct;
 pub mod recording;

@@ -2,10 +2,13 @@
 
 use std::ops::Range;
 
-use stspp_matcher::{Error as MatchError, Matcher, Method, Params, ShapeFunction, StereoStack};
+use stspp_matcher::{
+    Error as MatchError, Image, Matched, Matcher, Method, Params, Sample, ShapeFunction,
+    StereoStack,
+};
 
 use crate::cpu_time::{Step, Stopwatch};
-use crate::recording::{Recording, RecordingError};
+use crate::recording::{Recording, RecordingError, StereoPair};
 use crate::rectify::{DepthRange, Rectifier, RectifyError, RectifyScratch};
 use crate::{DepthFrame, SlotLabel, reproject};
 
@@ -163,57 +166,129 @@ pub fn reconstruct(
     progress("rectifying");
     let rectifier = Rectifier::new(&recording.calibration, options.depth)?;
     watch.step("rectification maps");
-    let mut scratch = RectifyScratch::default();
-    let (mut left, mut right) = (Vec::new(), Vec::new());
-    for pair in raw {
-        let (mut l, mut r) = (rectifier.canvas(), rectifier.canvas());
-        rectifier.rectify_left(&pair.left, &mut l, &mut scratch)?;
-        rectifier.rectify_right(&pair.right, &mut r, &mut scratch)?;
-        left.push(l);
-        right.push(r);
-    }
-    let left: Vec<_> = left.iter().collect();
-    let right: Vec<_> = right.iter().collect();
+    let stack = RectifiedStack::new(rectifier, &raw, window.labels)?;
+    drop(raw);
     watch.step("rectify");
 
     progress("matching");
-    let mut params = Params::new(rectifier.disparity_range());
+    let mut params = Params::new(stack.rectifier.disparity_range());
     params.method = options.method;
     params.shape = options.shape;
     params.advanced.threads = options.threads;
     let mut matcher = Matcher::new(params)?;
-    let times_s = times_s(&window.labels);
-    let stack = StereoStack {
-        left: &left,
-        right: &right,
-        left_mask: Some(rectifier.left_mask()),
-        right_mask: Some(rectifier.right_mask()),
-        times_s: times_s.as_deref(),
-    };
-    let matched = matcher.match_stack(&stack)?;
+    let matched = stack.matched(&mut matcher, 0..stack.len())?;
     watch.step("match");
 
     progress("reprojecting");
     let intensity = match texture {
         Some(raw) => {
-            let mut canvas = rectifier.canvas();
-            rectifier.rectify_left(&raw, &mut canvas, &mut scratch)?;
+            let mut canvas = stack.rectifier.canvas();
+            stack.rectifier.rectify_left(&raw, &mut canvas, &mut RectifyScratch::default())?;
             reproject::mean_intensity(&[&canvas])
         }
-        None => reproject::mean_intensity(&left),
+        None => reproject::mean_intensity(&stack.left.iter().collect::<Vec<_>>()),
     };
-    let frame = reproject::depth_frame(rectifier.geometry(), matched, intensity, window.labels);
+    let geometry = stack.rectifier.geometry();
+    let frame = reproject::depth_frame(geometry, matched, intensity, stack.labels);
     watch.step("reproject");
     Ok(Reconstruction {
         frame,
         params: matcher.params().clone(),
         pairs: window.pairs,
         bits: recording.bits(),
-        seen_pixels: rectifier.left_mask().as_slice().iter().filter(|seen| **seen != 0).count(),
+        seen_pixels: stack.rectifier.seen_pixels(),
         threads: matcher.threads(),
         simd: matcher.level().name(),
         steps: watch.steps().to_vec(),
     })
+}
+
+/// Rectified pairs, ready to be matched in any number and by any method.
+pub struct RectifiedStack {
+    /// How they were rectified.
+    pub rectifier: Rectifier,
+    /// Left canvases in time order.
+    pub left: Vec<Image<Sample>>,
+    /// Right canvases in time order.
+    pub right: Vec<Image<Sample>>,
+    /// What lit each pair; empty when unknown.
+    pub labels: Vec<SlotLabel>,
+}
+
+impl RectifiedStack {
+    /// Rectifies pairs.
+    ///
+    /// # Errors
+    /// For images of another size than the calibration's.
+    pub fn new(
+        rectifier: Rectifier,
+        pairs: &[StereoPair],
+        labels: Vec<SlotLabel>,
+    ) -> Result<Self, RectifyError> {
+        let mut scratch = RectifyScratch::default();
+        let (mut left, mut right) = (Vec::new(), Vec::new());
+        for pair in pairs {
+            let (mut l, mut r) = (rectifier.canvas(), rectifier.canvas());
+            rectifier.rectify_left(&pair.left, &mut l, &mut scratch)?;
+            rectifier.rectify_right(&pair.right, &mut r, &mut scratch)?;
+            left.push(l);
+            right.push(r);
+        }
+        Ok(Self { rectifier, left, right, labels })
+    }
+
+    /// Number of pairs.
+    pub fn len(&self) -> usize {
+        self.left.len()
+    }
+
+    /// Whether there is no pair.
+    pub fn is_empty(&self) -> bool {
+        self.left.is_empty()
+    }
+
+    /// Matches pairs `window`.
+    ///
+    /// # Errors
+    /// From the matcher.
+    ///
+    /// # Panics
+    /// When `window` reaches beyond [`Self::len`].
+    pub fn matched(
+        &self,
+        matcher: &mut Matcher,
+        window: Range<usize>,
+    ) -> Result<Matched, MatchError> {
+        let left: Vec<_> = self.left[window.clone()].iter().collect();
+        let right: Vec<_> = self.right[window.clone()].iter().collect();
+        let times_s = self.labels.get(window).and_then(times_s);
+        matcher.match_stack(&StereoStack {
+            left: &left,
+            right: &right,
+            left_mask: Some(self.rectifier.left_mask()),
+            right_mask: Some(self.rectifier.right_mask()),
+            times_s: times_s.as_deref(),
+        })
+    }
+
+    /// Matches pairs `window` and makes a depth frame of them.
+    ///
+    /// # Errors
+    /// From the matcher.
+    ///
+    /// # Panics
+    /// When `window` reaches beyond [`Self::len`].
+    pub fn depth_frame(
+        &self,
+        matcher: &mut Matcher,
+        window: Range<usize>,
+    ) -> Result<DepthFrame, MatchError> {
+        let matched = self.matched(matcher, window.clone())?;
+        let left: Vec<_> = self.left[window.clone()].iter().collect();
+        let labels = self.labels.get(window).map(<[_]>::to_vec).unwrap_or_default();
+        let intensity = reproject::mean_intensity(&left);
+        Ok(reproject::depth_frame(self.rectifier.geometry(), matched, intensity, labels))
+    }
 }
 
 /// Exposure centres, when the labels hold times at all.

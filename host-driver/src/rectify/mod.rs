@@ -159,6 +159,11 @@ impl Rectifier {
         &self.right.mask
     }
 
+    /// Number of canvas pixels that the left camera saw.
+    pub fn seen_pixels(&self) -> usize {
+        self.left.mask.as_slice().iter().filter(|seen| **seen != 0).count()
+    }
+
     /// An image of the canvas's size, to rectify into.
     pub fn canvas(&self) -> Image<Sample> {
         Image::new(self.geometry.width, self.geometry.height, 0)

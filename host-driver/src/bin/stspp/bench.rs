@@ -1,12 +1,27 @@
 //! `stspp bench`: time per stage, and accuracy against truth.
-use crate::exit::{Failure, Kind};
+
+mod accuracy;
+
+use clap::Subcommand;
+
+use crate::exit::Failure;
 use crate::output::Output;
 
 /// Measure time per stage, or accuracy.
 #[derive(clap::Args)]
-pub struct Args {}
+pub struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand)]
+enum What {
+    Accuracy(accuracy::Args),
+}
 
 /// Runs the verb.
-pub fn run(_args: &Args, _output: &Output) -> Result<(), Failure> {
-    Err(Failure::new(Kind::Other, "bench is not in this build"))
+pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
+    match &args.what {
+        What::Accuracy(args) => accuracy::run(args, output),
+    }
 }

@@ -1,0 +1,110 @@
+//! Recordings of simulated scenes with ideal timing: one projector a frame.
+
+use nalgebra::Isometry3;
+use stspp_hil_sim::world::{
+    CameraModel, LightInterval, LightSource, RawImage as SimImage, SceneSpec, SensorModel, World,
+    WorldError,
+};
+use stspp_matcher::Image;
+
+use crate::recording::StereoPair;
+use crate::{CameraIntrinsics, RawImage, SlotLabel, StereoCalibration};
+
+/// The paper's timing: 30 frames a second, exposed for 32 ms.
+const FRAME_PERIOD_US: u64 = 33_333;
+const EXPOSURE_US: u64 = 32_000;
+
+fn intrinsics_of(camera: &CameraModel) -> CameraIntrinsics {
+    CameraIntrinsics {
+        focal_px: camera.focal_px,
+        principal_px: camera.principal_px,
+        radtan: camera.radtan,
+        resolution_px: [camera.width, camera.height],
+    }
+}
+
+/// The true calibration of a simulated sensor.
+pub fn calibration_of(model: &SensorModel) -> StereoCalibration {
+    let right_from_left: Isometry3<f64> = model.right_from_left;
+    StereoCalibration {
+        left: intrinsics_of(&model.left),
+        right: intrinsics_of(&model.right),
+        right_from_left,
+        temperature_c: None,
+        date: None,
+    }
+}
+
+/// A simulated camera's image as a real one's.
+pub fn raw_of(image: SimImage) -> RawImage {
+    let (width, height, bits) = (image.width, image.height, image.bits);
+    // The simulator's images have as many pixels as they say: no fill is ever seen.
+    if bits <= 8 {
+        let pixels = image.data.iter().map(|&v| v as u8).collect();
+        let pixels = Image::from_vec(width, height, pixels);
+        RawImage::gray8(pixels.unwrap_or_else(|| Image::new(width, height, 0)))
+    } else {
+        let pixels = Image::from_vec(width, height, image.data);
+        RawImage::gray16(pixels.unwrap_or_else(|| Image::new(width, height, 0)), bits)
+    }
+}
+
+/// A scene before the simulated sensor, and what its cameras recorded.
+#[derive(Debug)]
+pub struct Capture {
+    /// The scene.
+    pub world: World,
+    /// The sensor's calibration, without error.
+    pub calibration: StereoCalibration,
+    /// One pair for each projector, in time order.
+    pub pairs: Vec<StereoPair>,
+    /// What lit each pair.
+    pub labels: Vec<SlotLabel>,
+}
+
+impl Capture {
+    /// Records `frames` pairs of a scene, pair k lit by projector k alone. `progress` is told each.
+    ///
+    /// # Errors
+    /// For a scene or a sensor that cannot be simulated.
+    pub fn record(
+        scene: &SceneSpec,
+        model: SensorModel,
+        frames: usize,
+        progress: &mut dyn FnMut(usize),
+    ) -> Result<Self, WorldError> {
+        let calibration = calibration_of(&model);
+        let world = World::new(scene, model)?;
+        let (mut pairs, mut labels) = (Vec::new(), Vec::new());
+        for k in 0..frames {
+            progress(k);
+            let trigger_time_us = k as u64 * FRAME_PERIOD_US;
+            let (open_ns, close_ns) =
+                (trigger_time_us * 1000, (trigger_time_us + EXPOSURE_US) * 1000);
+            let projector = (k % world.model().projectors.len().max(1)) as u8;
+            let light = LightInterval {
+                source: LightSource::Projector(projector),
+                on_ns: open_ns,
+                off_ns: close_ns,
+            };
+            let (left, right) = world.expose_pair(open_ns, close_ns, &[light], k as u64);
+            pairs.push(StereoPair { left: raw_of(left), right: raw_of(right) });
+            labels.push(SlotLabel {
+                sequence: k as u32,
+                slot: k as u16,
+                projector_mask: 1 << projector,
+                floodlight: false,
+                trigger_time_us,
+                exposure_us: EXPOSURE_US as u32,
+            });
+        }
+        Ok(Self { world, calibration, pairs, labels })
+    }
+
+    /// Centre of the recording's exposures `first..first + frames` in nanoseconds of the scene's time.
+    pub fn centre_ns(&self, frames: std::ops::Range<usize>) -> u64 {
+        let times = self.labels[frames].iter().map(SlotLabel::exposure_centre_s);
+        let (sum, count) = times.fold((0.0, 0), |(sum, n), t| (sum + t, n + 1));
+        (sum / f64::from(count.max(1)) * 1e9) as u64
+    }
+}

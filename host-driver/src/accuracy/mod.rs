@@ -1,0 +1,11 @@
+//! Accuracy on the simulated sensor: recordings of known scenes, reconstructed and compared with the
+//! truth behind every pixel.
+
+pub mod capture;
+pub mod score;
+pub mod tables;
+pub mod truth;
+
+pub use capture::{Capture, calibration_of};
+pub use score::Score;
+pub use truth::CanvasTruth;

@@ -1,0 +1,195 @@
+//! The accuracy tables: sphere over the number of frames, planes over distance.
+
+use serde::Serialize;
+use stspp_hil_sim::world::{SceneSpec, SensorModel, WorldError};
+use stspp_matcher::{Error as MatchError, Matcher, Method, Params, ShapeFunction};
+
+use super::score::{central_plane_rms_mm, score, sphere_rms_mm};
+use super::{CanvasTruth, Capture, Score};
+use crate::reconstruct::RectifiedStack;
+use crate::rectify::{DepthRange, Rectifier, RectifyError};
+
+/// Radius of the sphere in metres.
+const SPHERE_RADIUS_M: f64 = 0.075;
+/// Pixels around a fitted point that belong to the same surface: half a 9x9 subset and one more.
+const MARGIN_PX: usize = 5;
+
+/// Why a table could not be made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum AccuracyError {
+    /// The scene or the sensor cannot be simulated.
+    #[error(transparent)]
+    World(#[from] WorldError),
+    /// The simulated images cannot be rectified.
+    #[error(transparent)]
+    Rectify(#[from] RectifyError),
+    /// The stack cannot be matched.
+    #[error(transparent)]
+    Match(#[from] MatchError),
+}
+
+/// How the table's frames are matched.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Setting {
+    /// How the sub-pixel disparity is found.
+    pub method: Method,
+    /// Order of the shape function.
+    pub shape: ShapeFunction,
+    /// Threads of the matcher; all cores when `None`.
+    pub threads: Option<usize>,
+}
+
+/// A scene, simulated and rectified, with the truth of its canvas.
+pub struct Case {
+    capture: Capture,
+    stack: RectifiedStack,
+    truth: CanvasTruth,
+}
+
+/// One line of a table.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Line {
+    /// The scene.
+    pub scene: String,
+    /// Frames matched.
+    pub frames: usize,
+    /// Sub-pixel method.
+    pub method: String,
+    /// Order of the shape function.
+    pub shape_function: String,
+    /// RMS of the plane fit over the central half, or of the sphere fit, in millimetres.
+    pub fit_rms_mm: Option<f64>,
+    /// Error of the fitted sphere's radius in millimetres.
+    pub radius_error_mm: Option<f64>,
+    /// Against the truth.
+    pub score: Score,
+    /// Wall time of the match in milliseconds.
+    pub match_wall_ms: f64,
+}
+
+impl Case {
+    /// Simulates `frames` pairs of a scene.
+    ///
+    /// # Errors
+    /// For a scene or a sensor that cannot be simulated.
+    pub fn new(
+        scene: &SceneSpec,
+        model: SensorModel,
+        frames: usize,
+        progress: &mut dyn FnMut(usize),
+    ) -> Result<Self, AccuracyError> {
+        let capture = Capture::record(scene, model, frames, progress)?;
+        Self::of_capture(capture)
+    }
+
+    /// Rectifies a capture and traces its truth.
+    ///
+    /// # Errors
+    /// For images that cannot be rectified.
+    pub fn of_capture(mut capture: Capture) -> Result<Self, AccuracyError> {
+        let rectifier = Rectifier::new(&capture.calibration, DepthRange::default())?;
+        let stack = RectifiedStack::new(rectifier, &capture.pairs, capture.labels.clone())?;
+        // The raw images are not needed again, and there may be several cases.
+        capture.pairs = Vec::new();
+        let truth = CanvasTruth::trace(
+            &capture.world,
+            stack.rectifier.geometry(),
+            stack.rectifier.left_mask(),
+            capture.centre_ns(0..stack.len()),
+        );
+        Ok(Self { capture, stack, truth })
+    }
+
+    /// Rectified images of the case.
+    pub fn stack(&self) -> &RectifiedStack {
+        &self.stack
+    }
+
+    /// The truth of its canvas.
+    pub fn truth(&self) -> &CanvasTruth {
+        &self.truth
+    }
+
+    /// Matches the first `frames` pairs and compares with the truth.
+    ///
+    /// # Errors
+    /// From the matcher.
+    pub fn line(
+        &self,
+        scene: &str,
+        frames: usize,
+        setting: Setting,
+    ) -> Result<Line, AccuracyError> {
+        let mut params = Params::new(self.stack.rectifier.disparity_range());
+        params.method = setting.method;
+        params.shape = setting.shape;
+        params.advanced.threads = setting.threads;
+        let mut matcher = Matcher::new(params)?;
+        let start = std::time::Instant::now();
+        let frame = self.stack.depth_frame(&mut matcher, 0..frames)?;
+        let match_wall_ms = start.elapsed().as_secs_f64() * 1e3;
+        let (world, truth) = (&self.capture.world, &self.truth);
+        let (fit_rms_mm, radius_error_mm) = if scene.starts_with("sphere") {
+            sphere_rms_mm(&frame, truth, world, SPHERE_RADIUS_M, MARGIN_PX)
+                .map_or((None, None), |(rms, radius)| (Some(rms), Some(radius)))
+        } else if scene.contains("plane") {
+            (central_plane_rms_mm(&frame, truth).ok(), None)
+        } else {
+            (None, None)
+        };
+        Ok(Line {
+            scene: scene.to_owned(),
+            frames,
+            method: format!("{:?}", setting.method),
+            shape_function: format!("{:?}", setting.shape),
+            fit_rms_mm,
+            radius_error_mm,
+            score: score(&frame, truth),
+            match_wall_ms,
+        })
+    }
+}
+
+/// Lines as text columns.
+pub fn to_text(lines: &[Line]) -> String {
+    let mut text = format!(
+        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>8}\n",
+        "scene",
+        "N",
+        "method",
+        "order",
+        "fit RMS",
+        "radius",
+        "points",
+        "complete",
+        "outliers",
+        "surf RMS",
+        "median",
+        "match"
+    );
+    text += &format!(
+        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>8}\n",
+        "", "", "", "", "mm", "mm", "", "%", "%", "mm", "mm", "ms"
+    );
+    let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.4}"));
+    for line in lines {
+        let score = &line.score;
+        text += &format!(
+            "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9.3} {:>9.4} {:>9.4} {:>9.4} {:>8.0}\n",
+            line.scene,
+            line.frames,
+            line.method,
+            line.shape_function,
+            number(line.fit_rms_mm),
+            number(line.radius_error_mm),
+            score.points,
+            100.0 * score.completeness,
+            100.0 * score.outliers,
+            score.surface_rms_mm,
+            score.surface_median_mm,
+            line.match_wall_ms,
+        );
+    }
+    text
+}
