@@ -176,7 +176,7 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
             now_us: 0,
             last_heard_us: 0,
             interlock,
-            duty: DutyBudget::new(&limits),
+            duty: DutyBudget::new(&limits, boot.cause == ResetCause::PowerOn),
             sequencer,
             floodlight: None,
             outbox,

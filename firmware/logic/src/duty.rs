@@ -7,6 +7,9 @@
 //! A run is admitted while the buckets of the emitters that it lights are at most half full. That is
 //! enough: within a run every full slot cycle adds at most what leaks meanwhile (the validator sees to
 //! it), and no part of a cycle adds more than `duty *` the longest cycle, which is half the capacity.
+//!
+//! Only power-on starts with empty buckets. After any other reset they are full, because nobody knows
+//! what was lit before: else a host could pass the limit by asking for resets.
 
 use stspp_protocol::timing::{Limits, MAX_PROJECTORS};
 use stspp_protocol::units::PERMILLE;
@@ -38,13 +41,10 @@ struct Bucket {
 }
 
 impl Bucket {
-    const fn new(duty_permille: u16, window_us: u32) -> Self {
+    const fn new(duty_permille: u16, window_us: u32, rested: bool) -> Self {
         let leak_permille = duty_permille as u32;
-        Self {
-            level: 0,
-            leak_permille,
-            capacity: (leak_permille as u64).saturating_mul(window_us as u64),
-        }
+        let capacity = (leak_permille as u64).saturating_mul(window_us as u64);
+        Self { level: if rested { 0 } else { capacity }, leak_permille, capacity }
     }
 
     const fn half(&self) -> u64 {
@@ -62,13 +62,13 @@ pub struct DutyBudget {
 }
 
 impl DutyBudget {
-    /// Empty buckets at device time 0.
+    /// The buckets at device time 0: empty where the emitters are known to be rested, else full.
     #[must_use]
-    pub const fn new(limits: &Limits) -> Self {
-        let window = limits.duty_window_us;
+    pub fn new(limits: &Limits, rested: bool) -> Self {
+        let bucket = |duty_permille| Bucket::new(duty_permille, limits.duty_window_us, rested);
         Self {
-            projectors: [Bucket::new(limits.max_projector_duty_permille, window); MAX_PROJECTORS],
-            floodlight: Bucket::new(limits.max_floodlight_duty_permille, window),
+            projectors: [bucket(limits.max_projector_duty_permille); MAX_PROJECTORS],
+            floodlight: bucket(limits.max_floodlight_duty_permille),
             projector_count: limits.projector_count,
             updated_us: 0,
         }

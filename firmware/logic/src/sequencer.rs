@@ -116,7 +116,11 @@ impl Sequencer {
     /// Takes a timing that the engine has been loaded with.
     pub fn accept(&mut self, timing: ProjectionTiming) {
         if let Some(run) = &mut self.run {
-            run.slowest_period_us = run.slowest_period_us.max(timing.frame_period_us);
+            // The slot that is due may be the first of the new timing already.
+            let slower_by_us = timing.frame_period_us.saturating_sub(run.slowest_period_us);
+            run.slowest_period_us = run.slowest_period_us.saturating_add(slower_by_us);
+            run.deadline_us =
+                run.deadline_us.saturating_add(u64::from(slower_by_us).saturating_mul(2));
         }
         self.timing = timing;
         self.generation = self.next_generation();

@@ -1,0 +1,8 @@
+//! The in-process device from outside: bytes in, bytes and edges out.
+
+mod dialogue;
+mod edges;
+mod faults;
+mod host;
+mod safety;
+mod settings;
