@@ -6,7 +6,7 @@ use crate::{
     Error, Image, Level, Matched, Method, Params, StageTime, StereoStack,
     census::PaddedStack,
     check,
-    icgn::{self, guess::CoarseMap, prepare::Prepared},
+    icgn::{field::Field, guess::CoarseMap, prepare::Prepared},
     parallel::Pool,
     search::{self, Coarse},
 };
@@ -28,6 +28,7 @@ pub struct Matcher {
     right: PaddedStack,
     prepared: Prepared,
     map: CoarseMap,
+    field: Field,
 }
 
 impl Matcher {
@@ -47,6 +48,7 @@ impl Matcher {
             right: PaddedStack::default(),
             prepared: Prepared::default(),
             map: CoarseMap::default(),
+            field: Field::default(),
         })
     }
 
@@ -116,9 +118,15 @@ impl Matcher {
         self.prepared.fill(stack, self.params.advanced.interpolation);
         self.map.fill(&coarse.disparity_px);
         clock.stage("prepare");
-        let (disparity_px, zncc) =
-            icgn::refine_map(&self.prepared, &self.map, &self.params, self.level);
+        let Self { field, prepared, map, params, level, .. } = self;
+        field.refine(prepared, map, stack.left_mask, params, *level);
         clock.stage("icgn");
+        let (mut disparity_px, mut zncc) = (field.disparity_px(), field.zncc());
+        check::remove_small_regions(&mut disparity_px, params.advanced.region_min);
+        for (z, d) in zncc.as_mut_slice().iter_mut().zip(disparity_px.as_slice()) {
+            *z = if d.is_nan() { f32::NAN } else { *z };
+        }
+        clock.stage("outlier");
         Matched { disparity_px, zncc, rate_px_per_s: None, stages: clock.stages }
     }
 }

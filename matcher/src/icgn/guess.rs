@@ -17,6 +17,11 @@ pub struct CoarseMap {
 }
 
 impl CoarseMap {
+    /// Sets one disparity.
+    pub(super) fn set(&mut self, x: usize, y: usize, value: f32) {
+        self.values[(MARGIN + y) * self.pitch + MARGIN + x] = value;
+    }
+
     /// Copies `map`, reusing this one's memory.
     pub fn fill(&mut self, map: &Image<f32>) {
         self.pitch = map.width() + 2 * MARGIN;
@@ -80,9 +85,42 @@ impl Guesser {
         Self { radius, parameters, surface_px, inverse, full }
     }
 
+    /// Radius of the square.
+    pub fn radius(&self) -> usize {
+        self.radius
+    }
+
     /// The full square.
     pub fn full(&self) -> &Window {
         &self.full
+    }
+
+    /// Selects into `part` the pixels of the square about (x, y) whose disparity is within the
+    /// tolerance of `shape`, and the centre and its direct neighbours where they have none.
+    pub(super) fn select_near(
+        &self,
+        map: &CoarseMap,
+        prepared: &Prepared,
+        (x, y): (usize, usize),
+        shape: &Shape,
+        part: &mut Window,
+    ) {
+        let (width, height) = (prepared.width as i64, prepared.height as i64);
+        part.select(self.radius, prepared, |dx, dy| {
+            let (px, py) = (x as i64 + dx as i64, y as i64 + dy as i64);
+            if px < 0 || py < 0 || px >= width || py >= height {
+                return false;
+            }
+            let warped = x as f64 + shape.warp(dx as f64, dy as f64);
+            let known = map.at(px as usize, py as usize) as f64;
+            let member = if known.is_nan() {
+                dx.abs() <= 1 && dy.abs() <= 1
+            } else {
+                (known - (px as f64 - warped)).abs() <= self.surface_px as f64 || (dx, dy) == (0, 0)
+            };
+            let column = warped.floor() as i64;
+            member && prepared.right_is_inside(py as usize, column, column + 1)
+        });
     }
 
     /// Starts the subset about (x, y), whose coarse disparity is a number; selects into `part` when

@@ -1,5 +1,6 @@
 //! Sub-pixel refinement: Stereo-DIC by inverse-compositional Gauss-Newton (paper eq 7-19).
 
+pub mod field;
 pub mod guess;
 mod kernel;
 pub mod prepare;
@@ -7,7 +8,7 @@ pub mod shape;
 mod solve;
 pub mod window;
 
-use crate::{Image, Level, Params, ShapeFunction, zncc};
+use crate::{Level, Params, zncc};
 use guess::{CoarseMap, Guess, Guesser};
 use kernel::Kernel;
 use prepare::Prepared;
@@ -15,19 +16,23 @@ use shape::Shape;
 use solve::Cholesky;
 use window::Window;
 
-/// Columns and rows that a task works through together: their subsets share cache lines.
-const TILE: usize = 64;
-
 /// How far a refined disparity may be from the initial guess. The coarse search is right to half a
 /// pixel or wrong altogether; further away the subset has slid to another optimum.
 pub const DRIFT_LIMIT_PX: f64 = 2.0;
+
+/// How far a grown pixel may be from its neighbour's prediction: it is to continue the surface.
+pub const GROWTH_STEP_PX: f64 = 0.5;
+
+/// Subsets with a smaller part of their square than this are fitted to first order: half a square
+/// hardly tells curvature from slope.
+const SECOND_ORDER_PART: f64 = 0.6;
 
 /// A refined point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refined {
     /// Shape function at convergence; its u is minus the disparity.
     pub shape: Shape,
-    /// Similarity 1 - ZNSSD / 2.
+    /// Similarity 1 - ZNSSD / 2 of the subset.
     pub zncc: f64,
     /// Iterations used.
     pub iterations: usize,
@@ -37,54 +42,100 @@ pub struct Refined {
 #[derive(Debug)]
 pub struct Refiner<'a> {
     prepared: &'a Prepared,
-    kernel: Kernel,
+    /// Kernels of first and second order.
+    kernels: [Kernel; 2],
     guesser: Guesser,
-    parameters: usize,
+    second: bool,
     convergence_px: f64,
     iterations_max: usize,
+    zncc_min: f64,
+    surface_px: f32,
 }
 
 impl<'a> Refiner<'a> {
     /// A refiner with shape functions of first or second order.
     pub fn new(prepared: &'a Prepared, params: &Params, second: bool, level: Level) -> Self {
-        let parameters = if second { 6 } else { 3 };
         let advanced = &params.advanced;
+        let (radius, surface_px) = (advanced.subset_radius, advanced.surface_px);
+        let parameters = if second { 6 } else { 3 };
         Self {
             prepared,
-            kernel: Kernel::new(level, prepared.kind, parameters),
-            guesser: Guesser::new(
-                advanced.subset_radius,
-                parameters,
-                advanced.surface_px,
-                prepared,
-            ),
-            parameters,
+            kernels: [3, 6].map(|parameters| Kernel::new(level, prepared.kind, parameters)),
+            guesser: Guesser::new(radius, parameters, surface_px, prepared),
+            second,
             convergence_px: advanced.convergence_px,
             iterations_max: advanced.iterations_max,
+            zncc_min: params.zncc_min as f64,
+            surface_px,
         }
     }
 
-    /// Guesses and refines the point (x, y); `part` is scratch.
+    /// Guesses and refines the point (x, y), and accepts it when it is similar enough; `part` is
+    /// scratch.
     pub fn point(&self, map: &CoarseMap, x: usize, y: usize, part: &mut Window) -> Option<Refined> {
         match self.guesser.guess(map, self.prepared, x, y, part) {
-            Guess::Full(shape) => self.refine(self.guesser.full(), x, y, shape),
-            Guess::Part(shape) => self.refine(part, x, y, shape),
+            Guess::Full(shape) => {
+                let refined = self.refine(self.guesser.full(), x, y, shape)?;
+                (refined.zncc >= self.zncc_min).then_some(refined)
+            }
+            Guess::Part(shape) => {
+                let refined = self.refine(part, x, y, shape)?;
+                self.belongs(map, x, y, &refined, part).then_some(refined)
+            }
             Guess::None => None,
         }
     }
 
-    /// Gauss-Newton from `start` (eq 15-17); `None` when it does not converge or the subset has no
-    /// texture.
+    /// Refines the point (x, y) of a gap from a neighbour's prediction.
+    fn grown(
+        &self,
+        map: &CoarseMap,
+        x: usize,
+        y: usize,
+        start: Shape,
+        part: &mut Window,
+    ) -> Option<Refined> {
+        self.guesser.select_near(map, self.prepared, (x, y), &start, part);
+        if part.count() < 2 * self.guesser.radius() + 1 {
+            return None;
+        }
+        let refined = self.refine(part, x, y, start)?;
+        let near = (refined.shape.0[0] - start.0[0]).abs() <= GROWTH_STEP_PX;
+        (near && self.belongs(map, x, y, &refined, part)).then_some(refined)
+    }
+
+    /// Gauss-Newton from `start`, to second order where that is asked for, the subset is large enough
+    /// and it converges, else to first order.
     pub fn refine(&self, window: &Window, x: usize, y: usize, start: Shape) -> Option<Refined> {
+        let side = 2 * self.guesser.radius() + 1;
+        let enough = window.count() as f64 >= SECOND_ORDER_PART * (side * side) as f64;
+        if self.second
+            && enough
+            && let Some(refined) = self.iterate::<6>(window, x, y, start)
+        {
+            return Some(refined);
+        }
+        let mut start = start;
+        start.0[3..].fill(0.0);
+        self.iterate::<3>(window, x, y, start)
+    }
+
+    /// Gauss-Newton from `start` with K parameters (eq 15-17); `None` when it does not converge or the
+    /// subset has no texture.
+    fn iterate<const K: usize>(
+        &self,
+        window: &Window,
+        x: usize,
+        y: usize,
+        start: Shape,
+    ) -> Option<Refined> {
+        let kernel = &self.kernels[K / 6];
         let n = (window.count() * self.prepared.frames) as f64;
-        let reference = self.kernel.reference(self.prepared, window, x, y);
+        let reference = kernel.reference(self.prepared, window, x, y);
         let mean_l = reference.l / n;
         let norm_l = zncc::norm(reference.l, reference.ll, n)?;
-        let mut hessian = reference.hessian;
-        for (k, row) in hessian.iter_mut().enumerate().skip(self.parameters) {
-            row[k] = 1.0;
-        }
-        let factor = Cholesky::new(hessian)?;
+        let hessian = std::array::from_fn(|k| std::array::from_fn(|j| reference.hessian[k][j]));
+        let factor = Cholesky::<K>::new(hessian)?;
         // Positions are relative to the whole column that the start points to, which keeps them short
         // enough for single precision.
         let base = (x as f64 + start.0[0]).floor();
@@ -96,7 +147,7 @@ impl<'a> Refiner<'a> {
         for iteration in 1..=self.iterations_max {
             let mut t = shape.0.map(|p| p as f32);
             t[0] = (shape.0[0] - offset) as f32;
-            let sums = self.kernel.warp(self.prepared, window, (x, y), base as i64, t);
+            let sums = kernel.warp(self.prepared, window, (x, y), base as i64, t);
             let (g, gg, lg) = (sums.g as f64, sums.gg as f64, sums.lg as f64);
             let mean_g = g / n;
             let norm_g = zncc::norm(g, gg, n)?;
@@ -106,7 +157,8 @@ impl<'a> Refiner<'a> {
                 let right = sums.ig[k] as f64 - mean_g * reference.i[k];
                 scale * right - left
             });
-            let step = Shape(factor.solve(residual));
+            let mut step = Shape::default();
+            step.0[..K].copy_from_slice(&factor.solve(residual));
             shape = shape.compose_inverse(&step)?;
             let drift = (shape.0[0] - start.0[0]).abs();
             // Written so that NaN fails too.
@@ -121,44 +173,57 @@ impl<'a> Refiner<'a> {
         }
         None
     }
-}
 
-/// Refines every pixel with a coarse disparity; NaN where that fails or the ZNCC is too low.
-pub fn refine_map(
-    prepared: &Prepared,
-    map: &CoarseMap,
-    params: &Params,
-    level: Level,
-) -> (Image<f32>, Image<f32>) {
-    use rayon::prelude::*;
-
-    let (width, height) = (prepared.width, prepared.height);
-    let second = params.shape != ShapeFunction::First;
-    let refiner = Refiner::new(prepared, params, second, level);
-    let mut disparity_px = Image::new(width, height, f32::NAN);
-    let mut zncc = Image::new(width, height, f32::NAN);
-    let band = width * 16;
-    disparity_px
-        .as_mut_slice()
-        .par_chunks_mut(band)
-        .zip(zncc.as_mut_slice().par_chunks_mut(band))
-        .enumerate()
-        .for_each_init(Window::empty, |part, (b, (disparity, zncc))| {
-            for first in (0..width).step_by(TILE) {
-                for row in 0..disparity.len() / width {
-                    for x in first..(first + TILE).min(width) {
-                        let y = b * 16 + row;
-                        if map.at(x, y).is_nan() {
-                            continue;
-                        }
-                        let Some(refined) = refiner.point(map, x, y, part) else { continue };
-                        if refined.zncc as f32 >= params.zncc_min {
-                            disparity[row * width + x] = -refined.shape.0[0] as f32;
-                            zncc[row * width + x] = refined.zncc as f32;
-                        }
-                    }
-                }
+    /// Whether the point itself, and not only its subset, is on the surface found.
+    ///
+    /// Near a depth step most of a subset can be on one surface and its centre on the other. The frames
+    /// of the centre and its direct neighbours then do not agree with the right image at that disparity,
+    /// whatever the subset's similarity.
+    fn belongs(
+        &self,
+        map: &CoarseMap,
+        x: usize,
+        y: usize,
+        refined: &Refined,
+        scratch: &mut Window,
+    ) -> bool {
+        if refined.zncc < self.zncc_min {
+            return false;
+        }
+        let shape = &refined.shape;
+        let radius = if self.prepared.frames >= 5 { 1 } else { 2 };
+        scratch.select(radius, self.prepared, |dx, dy| {
+            let (px, py) = (x as i64 + dx as i64, y as i64 + dy as i64);
+            let inside = (0..self.prepared.width as i64).contains(&px)
+                && (0..self.prepared.height as i64).contains(&py);
+            inside && {
+                let warped = x as f64 + shape.warp(dx as f64, dy as f64);
+                let column = warped.floor() as i64;
+                let known = map.at(px as usize, py as usize);
+                // A neighbour of another surface says nothing about this one.
+                let other = (known as f64 - (px as f64 - warped)).abs() > self.surface_px as f64;
+                (!other || (dx, dy) == (0, 0))
+                    && self.prepared.right_is_inside(py as usize, column, column + 1)
             }
         });
-    (disparity_px, zncc)
+        if scratch.count() == 0 {
+            return false;
+        }
+        let kernel = &self.kernels[1];
+        let n = (scratch.count() * self.prepared.frames) as f64;
+        let left = kernel.reference(self.prepared, scratch, x, y);
+        let base = (x as f64 + shape.0[0]).floor();
+        if !(base >= 0.0 && base < self.prepared.width as f64) {
+            return false;
+        }
+        let mut t = shape.0.map(|p| p as f32);
+        t[0] = (shape.0[0] + x as f64 - base) as f32;
+        let right = kernel.warp(self.prepared, scratch, (x, y), base as i64, t);
+        let (g, gg) = (right.g as f64, right.gg as f64);
+        let norms = zncc::norm(left.l, left.ll, n).zip(zncc::norm(g, gg, n));
+        norms.is_some_and(|(l, r)| (right.lg as f64 - left.l * g / n) / (l * r) >= LOCAL_ZNCC_MIN)
+    }
 }
+
+/// Least similarity of a point and its direct neighbours alone.
+pub const LOCAL_ZNCC_MIN: f64 = 0.6;

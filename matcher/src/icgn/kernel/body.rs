@@ -3,6 +3,8 @@
 // Indices run over several arrays at once, as in the formulas.
 #![allow(clippy::needless_range_loop)]
 
+use std::mem::MaybeUninit;
+
 use super::{Constants, Reference, WarpSums, lanes::Lanes};
 use crate::{
     bspline::{LANES, TAPS_MAX},
@@ -26,32 +28,30 @@ pub(super) unsafe fn warp_sums<V: Lanes, const TAPS: usize, const K: usize>(
     t: [f32; 6],
     constants: &Constants,
 ) -> WarpSums {
-    let mut column = [0i32; PIXELS_MAX];
-    let mut weights = [[0f32; PIXELS_MAX]; TAPS_MAX];
-    // Positions and spline weights, 16 pixels at a time.
-    for p in (0..window.padded()).step_by(LANES) {
-        let mut fraction = [0f32; LANES];
-        for i in 0..LANES {
-            let mut at = window.phi[1][p + i] + t[0];
+    let mut column = [const { MaybeUninit::<i32>::uninit() }; PIXELS_MAX];
+    let mut weights = [const { MaybeUninit::<f32>::uninit() }; TAPS_MAX * PIXELS_MAX];
+    let (column, weights) = (column.as_mut_ptr().cast::<i32>(), weights.as_mut_ptr().cast::<f32>());
+    // Positions and spline weights, a vector of pixels at a time.
+    for p in (0..window.padded()).step_by(V::N) {
+        // SAFETY: p + V::N is at most `padded`, at most PIXELS_MAX; positions are clamped to the
+        // image's width.
+        unsafe {
+            let phi = |k: usize| V::load(window.phi[k].as_ptr().add(p));
+            let mut at = phi(1).add(V::splat(t[0]));
             for k in 1..K {
-                at += t[k] * window.phi[k][p + i];
+                at = phi(k).mul_add(V::splat(t[k]), at);
             }
-            let at = at.max(place.limits.0).min(place.limits.1);
-            // SAFETY: finite and clamped to the image's width.
-            let mut whole = unsafe { at.to_int_unchecked::<i32>() };
-            whole -= (whole as f32 > at) as i32;
-            fraction[i] = at - whole as f32;
-            column[p + i] = whole * LANES as i32;
-        }
-        for tap in 0..TAPS {
-            let mut weight = [constants.polynomials[TAPS - 1][tap]; LANES];
-            for power in (0..TAPS - 1).rev() {
-                let c = constants.polynomials[power][tap];
-                for i in 0..LANES {
-                    weight[i] = weight[i] * fraction[i] + c;
+            at = at.max(V::splat(place.limits.0)).min(V::splat(place.limits.1));
+            let whole = at.floor();
+            let fraction = at.sub(whole);
+            whole.mul(V::splat(LANES as f32)).store_whole(column.add(p));
+            for tap in 0..TAPS {
+                let mut weight = V::splat(constants.polynomials[TAPS - 1][tap]);
+                for power in (0..TAPS - 1).rev() {
+                    weight = weight.mul_add(fraction, V::splat(constants.polynomials[power][tap]));
                 }
+                weight.store(weights.add(tap * PIXELS_MAX + p));
             }
-            weights[tap][p..p + LANES].copy_from_slice(&weight);
         }
     }
     let mut sums = WarpSums::default();
@@ -61,16 +61,17 @@ pub(super) unsafe fn warp_sums<V: Lanes, const TAPS: usize, const K: usize>(
         let mut ig = [zero; K];
         for p in 0..window.count {
             // SAFETY: the window fits, so its pixels are inside the left arrays; right columns are
-            // clamped to one pixel beyond the image, and TAPS / 2 more are inside the margins.
+            // clamped to one pixel beyond the image, and TAPS / 2 more are inside the margins. Columns
+            // and weights of all `count` pixels were written above.
             unsafe {
                 let left = (place.left + first).wrapping_add_signed(window.left_at[p] as isize);
                 let right = (place.right + first - (TAPS / 2 - 1) * LANES)
-                    .wrapping_add_signed(window.right_at[p] as isize + column[p] as isize);
+                    .wrapping_add_signed(window.right_at[p] as isize + *column.add(p) as isize);
                 let right = prepared.right.as_ptr().add(right);
-                let mut g = V::load(right).mul(V::splat(weights[0][p]));
+                let mut g = V::load(right).mul(V::splat(*weights.add(p)));
                 for tap in 1..TAPS {
                     let c = V::load(right.add(tap * LANES));
-                    g = c.mul_add(V::splat(weights[tap][p]), g);
+                    g = c.mul_add(V::splat(*weights.add(tap * PIXELS_MAX + p)), g);
                 }
                 g1 = g1.add(g);
                 g2 = g.mul_add(g, g2);

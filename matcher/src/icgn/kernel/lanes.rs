@@ -12,6 +12,25 @@ pub(super) trait Lanes: Copy {
     /// `N` values are readable at `from`.
     unsafe fn load(from: *const f32) -> Self;
 
+    /// # Safety
+    /// `N` values are writable at `to`.
+    unsafe fn store(self, to: *mut f32);
+
+    /// Stores whole numbers, which the lanes hold.
+    ///
+    /// # Safety
+    /// `N` values are writable at `to`, and the lanes are within the range of i32.
+    unsafe fn store_whole(self, to: *mut i32);
+
+    /// Rounds down; the lanes are within the range of i32.
+    fn floor(self) -> Self;
+
+    fn sub(self, other: Self) -> Self;
+
+    fn min(self, other: Self) -> Self;
+
+    fn max(self, other: Self) -> Self;
+
     fn add(self, other: Self) -> Self;
 
     fn mul(self, other: Self) -> Self;

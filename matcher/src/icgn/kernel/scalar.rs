@@ -31,6 +31,40 @@ impl Lanes for Four {
     }
 
     #[inline(always)]
+    unsafe fn store(self, to: *mut f32) {
+        // SAFETY: the caller promises room for four values.
+        unsafe { to.cast::<[f32; 4]>().write(self.0) }
+    }
+
+    #[inline(always)]
+    unsafe fn store_whole(self, to: *mut i32) {
+        // SAFETY: the caller promises room for four values, and their range.
+        unsafe { to.cast::<[i32; 4]>().write(self.0.map(|v| v.to_int_unchecked())) }
+    }
+
+    #[inline(always)]
+    fn floor(self) -> Self {
+        // SAFETY: the lanes are within the range of i32.
+        let whole = self.0.map(|v| unsafe { v.to_int_unchecked::<i32>() } as f32);
+        Self(whole).zip(self, |whole, v| if whole > v { whole - 1.0 } else { whole })
+    }
+
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self.zip(other, |a, b| a - b)
+    }
+
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        self.zip(other, |a, b| if a < b { a } else { b })
+    }
+
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.zip(other, |a, b| if a > b { a } else { b })
+    }
+
+    #[inline(always)]
     fn add(self, other: Self) -> Self {
         self.zip(other, |a, b| a + b)
     }

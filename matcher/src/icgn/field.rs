@@ -1,0 +1,208 @@
+//! Refinement of a whole map, and its growth: reliability-guided Stereo-DIC.
+//!
+//! Where the census window is too stiff - steep slopes, rims, image borders - a refined neighbour's
+//! shape function still predicts a pixel well enough for IC-GN to converge. So the refined map grows
+//! into its gaps, a ring of pixels a pass, as long as pixels are similar on their own account.
+
+use rayon::prelude::*;
+
+use super::{Refined, Refiner, guess::CoarseMap, prepare::Prepared, shape::Shape, window::Window};
+use crate::{Image, Level, Params, ShapeFunction};
+
+/// Columns and rows that a task works through together: their subsets share cache lines.
+const TILE: usize = 64;
+const BAND: usize = 16;
+
+/// Most passes of growth: what is further from any match is no gap but a hole.
+pub const PASSES_MAX: usize = 48;
+
+/// A point of the refined map.
+#[derive(Debug, Clone, Copy)]
+pub struct Estimate {
+    shape: [f32; 6],
+    zncc: f32,
+}
+
+impl Estimate {
+    const NONE: Self = Self { shape: [f32::NAN; 6], zncc: f32::NAN };
+
+    fn is_none(&self) -> bool {
+        self.zncc.is_nan()
+    }
+
+    /// The same surface seen from a centre that is (dx, dy) away.
+    fn moved(&self, dx: f64, dy: f64) -> Shape {
+        let [u, ux, uy, uxx, uyy, uxy] = self.shape.map(f64::from);
+        Shape([
+            u + ux * dx + uy * dy + 0.5 * uxx * dx * dx + 0.5 * uyy * dy * dy + uxy * dx * dy,
+            ux + uxx * dx + uxy * dy,
+            uy + uyy * dy + uxy * dx,
+            uxx,
+            uyy,
+            uxy,
+        ])
+    }
+}
+
+impl From<Refined> for Estimate {
+    fn from(refined: Refined) -> Self {
+        Self { shape: refined.shape.0.map(|p| p as f32), zncc: refined.zncc as f32 }
+    }
+}
+
+/// Refined points of a stack; keeps its memory between stacks.
+#[derive(Debug, Default)]
+pub struct Field {
+    width: usize,
+    height: usize,
+    points: Vec<Estimate>,
+}
+
+impl Field {
+    /// Refines every pixel with a coarse disparity, then grows. `map` becomes the refined disparity.
+    pub fn refine(
+        &mut self,
+        prepared: &Prepared,
+        map: &mut CoarseMap,
+        left_mask: Option<&Image<u8>>,
+        params: &Params,
+        level: Level,
+    ) {
+        (self.width, self.height) = (prepared.width, prepared.height);
+        self.points.clear();
+        self.points.resize(self.width * self.height, Estimate::NONE);
+        let second = params.shape != ShapeFunction::First;
+        let refiner = Refiner::new(prepared, params, second, level);
+        self.refine_matched(&refiner, map);
+        for (y, row) in self.points.chunks_exact(self.width).enumerate() {
+            for (x, point) in row.iter().enumerate() {
+                map.set(x, y, -point.shape[0]);
+            }
+        }
+        self.grow(&refiner, map, left_mask);
+    }
+
+    /// Disparity of every point; NaN where there is none.
+    pub fn disparity_px(&self) -> Image<f32> {
+        self.image(|p| -p.shape[0])
+    }
+
+    /// ZNCC of every point; NaN where there is none.
+    pub fn zncc(&self) -> Image<f32> {
+        self.image(|p| p.zncc)
+    }
+
+    fn image(&self, value: impl Fn(&Estimate) -> f32) -> Image<f32> {
+        let values = self.points.iter().map(value).collect();
+        Image::from_vec(self.width, self.height, values).expect("a point for every pixel")
+    }
+
+    fn refine_matched(&mut self, refiner: &Refiner<'_>, map: &CoarseMap) {
+        let width = self.width;
+        self.points.par_chunks_mut(width * BAND).enumerate().for_each_init(
+            Window::empty,
+            |part, (band, points)| {
+                for first in (0..width).step_by(TILE) {
+                    for (row, points) in points.chunks_exact_mut(width).enumerate() {
+                        let y = band * BAND + row;
+                        let last = (first + TILE).min(width);
+                        for (x, point) in (first..last).zip(&mut points[first..last]) {
+                            if map.at(x, y).is_nan() {
+                                continue;
+                            }
+                            if let Some(refined) = refiner.point(map, x, y, part) {
+                                *point = refined.into();
+                            }
+                        }
+                    }
+                }
+            },
+        );
+    }
+
+    /// Grows by a ring of pixels a pass. A pass sees only what the passes before it found, so the
+    /// order within a pass does not matter.
+    fn grow(&mut self, refiner: &Refiner<'_>, map: &mut CoarseMap, left_mask: Option<&Image<u8>>) {
+        let mut frontier: Vec<u32> = (0..self.points.len() as u32)
+            .filter(|&i| self.is_open(i as usize, left_mask))
+            .filter(|&i| self.neighbours(i as usize).any(|(j, ..)| !self.points[j].is_none()))
+            .collect();
+        for _ in 0..PASSES_MAX {
+            let found: Vec<(u32, Estimate)> = frontier
+                .par_iter()
+                .map_init(Window::empty, |part, &i| {
+                    self.grow_point(refiner, map, i as usize, part).map(|p| (i, p))
+                })
+                .flatten()
+                .collect();
+            if found.is_empty() {
+                break;
+            }
+            for &(i, point) in &found {
+                let i = i as usize;
+                self.points[i] = point;
+                map.set(i % self.width, i / self.width, -point.shape[0]);
+            }
+            frontier = found
+                .iter()
+                .flat_map(|&(i, _)| self.neighbours(i as usize).map(|(j, ..)| j as u32))
+                .filter(|&j| self.is_open(j as usize, left_mask))
+                .collect();
+            frontier.sort_unstable();
+            frontier.dedup();
+        }
+    }
+
+    fn is_open(&self, i: usize, left_mask: Option<&Image<u8>>) -> bool {
+        self.points[i].is_none() && left_mask.is_none_or(|m| m.as_slice()[i] != 0)
+    }
+
+    /// The up to eight neighbours of a pixel, and the way from each to it.
+    fn neighbours(&self, i: usize) -> impl Iterator<Item = (usize, i32, i32)> + use<> {
+        let (width, height) = (self.width as i32, self.height as i32);
+        let (x, y) = (i as i32 % width, i as i32 / width);
+        (-1..=1).flat_map(move |dy| (-1..=1).map(move |dx| (dx, dy))).filter_map(move |(dx, dy)| {
+            let (nx, ny) = (x + dx, y + dy);
+            let inside = nx >= 0 && ny >= 0 && nx < width && ny < height && (dx, dy) != (0, 0);
+            inside.then_some(((ny * width + nx) as usize, -dx, -dy))
+        })
+    }
+
+    /// Tries the surface of each neighbour, the most similar neighbour of a surface first, and keeps
+    /// the best.
+    fn grow_point(
+        &self,
+        refiner: &Refiner<'_>,
+        map: &CoarseMap,
+        i: usize,
+        part: &mut Window,
+    ) -> Option<Estimate> {
+        let (x, y) = (i % self.width, i / self.width);
+        let mut near = [(Estimate::NONE, 0, 0); 8];
+        let mut count = 0;
+        for (j, dx, dy) in self.neighbours(i) {
+            if !self.points[j].is_none() {
+                near[count] = (self.points[j], dx, dy);
+                count += 1;
+            }
+        }
+        let near = &mut near[..count];
+        near.sort_by(|a, b| b.0.zncc.total_cmp(&a.0.zncc));
+        let mut tried = [f64::NAN; 8];
+        let mut best: Option<Refined> = None;
+        for (k, (estimate, dx, dy)) in near.iter().enumerate() {
+            let start = estimate.moved(*dx as f64, *dy as f64);
+            let seen = |u: &f64| (u - start.0[0]).abs() <= refiner.surface_px as f64;
+            if tried[..k].iter().any(seen) {
+                continue;
+            }
+            tried[k] = start.0[0];
+            if let Some(refined) = refiner.grown(map, x, y, start, part)
+                && best.is_none_or(|b| refined.zncc > b.zncc)
+            {
+                best = Some(refined);
+            }
+        }
+        best.map(Estimate::from)
+    }
+}
