@@ -86,15 +86,15 @@ pub struct GetFaults;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClearFaults;
 
-/// Stores the timing so that the next power-on starts with it. Not while running.
+/// Stores the timing so that the next power-on starts with it. Only while no light is allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SaveSettings;
 
-/// Goes back to the stored settings. Not while running.
+/// Goes back to the stored settings. Only while no light is allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LoadSettings;
 
-/// Goes back to the settings of a new device, without storing them. Not while running.
+/// Goes back to the settings of a new device, without storing them. Only while no light is allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LoadDefaults;
 
