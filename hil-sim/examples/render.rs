@@ -18,7 +18,7 @@ use stspp_hil_sim::world::{
 };
 
 /// The exposure at which the default sensor is stated.
-const EXPOSURE_NS: u64 = 10_000_000;
+const EXPOSURE_NS: u64 = 32_000_000;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();

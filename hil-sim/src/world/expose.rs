@@ -109,7 +109,7 @@ impl Lights {
 }
 
 /// Movement within one sub-exposure, as a share of a pixel at 1 m, below which it is not divided.
-const SHARP_PX: f64 = 0.25;
+const SHARP_PX: f64 = 0.5;
 /// Most sub-exposures of one light.
 const MOST_SUB_EXPOSURES: u64 = 16;
 

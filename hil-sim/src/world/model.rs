@@ -103,7 +103,7 @@ impl SensorModel {
             right_from_left,
             projectors,
             floodlight,
-            ambient_e_per_s: 12_000.0,
+            ambient_e_per_s: 4_000.0,
             seed,
         }
     }

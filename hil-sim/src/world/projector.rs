@@ -49,13 +49,13 @@ impl Default for ProjectorModel {
     fn default() -> Self {
         Self {
             left_from_projector: Isometry3::identity(),
-            emitters: 800,
+            emitters: 720,
             emitter_min_distance: 0.62,
             tile_pitch: [0.077, 0.077],
             doe_orders: [6, 5],
-            dot_divergence_rad: 5.0e-4,
+            dot_divergence_rad: 4.75e-4,
             aperture_sigma_m: 2.5e-4,
-            peak_e_per_s: 1.31e6,
+            peak_e_per_s: 4.1e5,
             zero_order_gain: 1.2,
             copy_variation: 0.06,
             emitter_variation: 0.06,
@@ -66,6 +66,12 @@ impl Default for ProjectorModel {
 }
 
 impl ProjectorModel {
+    /// The dots' directions in direction cosines x, y of the projector's frame.
+    #[must_use]
+    pub fn dot_directions(&self) -> Vec<[f64; 2]> {
+        dots(self).iter().map(|dot| [dot.x, dot.y]).collect()
+    }
+
     /// Makes dots and tile larger over the same field, for cameras with fewer pixels.
     pub(crate) fn enlarge_dots(&mut self, factor: usize) {
         let f = factor as f64;
@@ -90,7 +96,7 @@ impl Default for FloodlightModel {
     fn default() -> Self {
         Self {
             left_from_floodlight: Isometry3::identity(),
-            peak_e_per_s: 7.0e5,
+            peak_e_per_s: 1.9e5,
             beam_exponent: 2.0,
         }
     }
