@@ -33,10 +33,6 @@ pub(crate) struct Rigid {
 }
 
 impl Rigid {
-    pub fn point(&self, p: &Vector3<f64>) -> Vector3<f64> {
-        self.rotation * p + self.translation
-    }
-
     pub fn vector(&self, v: &Vector3<f64>) -> Vector3<f64> {
         self.rotation * v
     }
@@ -86,11 +82,6 @@ impl Aabb {
     pub fn include(&mut self, p: &Vector3<f64>) {
         self.min = self.min.inf(p);
         self.max = self.max.sup(p);
-    }
-
-    pub fn padded(&self, by: f64) -> Self {
-        let d = Vector3::repeat(by);
-        Self { min: self.min - d, max: self.max + d }
     }
 
     /// Whether the ray passes through the box before `max_m`.

@@ -19,21 +19,23 @@ mod camera;
 mod error;
 mod expose;
 mod gbuffer;
-#[allow(dead_code)]
 mod geometry;
 mod illuminate;
-#[allow(dead_code)]
+mod isosurface;
 mod material;
+mod mesh_file;
 mod model;
 mod noise;
+mod panel;
+mod part;
 mod pattern;
 mod projector;
 mod psf;
-#[allow(dead_code)]
 mod scene;
-#[allow(dead_code)]
 mod shapes;
 mod spec;
+mod statue;
+mod trimesh;
 mod truth;
 
 pub use board::BoardTexture;
@@ -43,7 +45,7 @@ pub use expose::{Camera, LightInterval, LightSource, RawImage};
 pub use model::SensorModel;
 pub use projector::{FloodlightModel, ProjectorModel};
 pub use spec::{MaterialKind, OptionInfo, SceneInfo, SceneSpec, list_scenes};
-pub use truth::{Primitive, PrimitiveShape, SurfacePoint, Truth};
+pub use truth::{Primitive, PrimitiveShape, SurfaceMesh, SurfacePoint, Truth};
 
 use nalgebra::Isometry3;
 

@@ -3,6 +3,7 @@
 use nalgebra::Vector3;
 
 use super::geometry::{Hit, Ray};
+use super::trimesh::Triangles;
 
 /// A surface that rays can meet.
 pub(crate) trait Shape: Send + Sync {
@@ -17,6 +18,11 @@ pub(crate) trait Shape: Send + Sync {
     /// What is known about the surface by formula.
     fn features(&self) -> Vec<Feature> {
         Vec::new()
+    }
+
+    /// The surface's triangles, if it is made of them.
+    fn triangles(&self) -> Option<&Triangles> {
+        None
     }
 }
 

@@ -2,6 +2,9 @@
 
 use std::path::PathBuf;
 
+use nalgebra::Isometry3;
+
+use super::board::BoardTexture;
 use super::error::WorldError;
 
 /// A scene that [`SceneSpec::parse`] knows.
@@ -47,6 +50,11 @@ const TURN: OptionInfo = OptionInfo {
     summary: "turned about the vertical axis, -180 to 180",
 };
 
+const SHIFT_X: OptionInfo =
+    OptionInfo { name: "x_mm", default: "0", summary: "shifted to the right, -2000 to 2000" };
+const SHIFT_Y: OptionInfo =
+    OptionInfo { name: "y_mm", default: "0", summary: "shifted down, -2000 to 2000" };
+
 const fn distance(default: &'static str) -> OptionInfo {
     OptionInfo {
         name: "distance_m",
@@ -77,6 +85,90 @@ static SCENES: &[SceneInfo] = &[
                 default: "75",
                 summary: "radius of the sphere, 1 to 500",
             },
+            MATERIAL,
+            ALBEDO,
+        ],
+    },
+    SceneInfo {
+        name: "statue",
+        summary: "a plaster bust of 0.7 m with curls, eyes and drapery (paper, Figures 3 and 4)",
+        options: &[distance("1.2"), TILT, TURN, MATERIAL, ALBEDO],
+    },
+    SceneInfo {
+        name: "turntable",
+        summary: "the statue turning about its axis (paper, Figure 6)",
+        options: &[
+            distance("1.2"),
+            OptionInfo {
+                name: "rpm",
+                default: "1.2",
+                summary: "turns a minute, -60 to 60; positive turns its front to the sensor's right",
+            },
+            TURN,
+            MATERIAL,
+            ALBEDO,
+        ],
+    },
+    SceneInfo {
+        name: "part",
+        summary: "an industrial part with circles of radius 3, 10, 15 and 50 mm (paper, Figure 7)",
+        options: &[
+            distance("0.9"),
+            OptionInfo { default: "8", ..TILT },
+            OptionInfo { default: "-6", ..TURN },
+            MATERIAL,
+            ALBEDO,
+        ],
+    },
+    SceneInfo {
+        name: "panel",
+        summary: "a curved panel of 0.87 x 0.63 m like a car door's (paper, Figure 8)",
+        options: &[distance("1.6"), TILT, TURN, SHIFT_X, SHIFT_Y, MATERIAL, ALBEDO],
+    },
+    SceneInfo {
+        name: "wires",
+        summary: "rods of 3 mm and strips at many depths before a plane",
+        options: &[distance("1.0"), MATERIAL, ALBEDO],
+    },
+    SceneInfo {
+        name: "board",
+        summary: "a chessboard, for calibration under the floodlight",
+        options: &[
+            distance("1.0"),
+            TILT,
+            TURN,
+            OptionInfo {
+                name: "roll_deg",
+                default: "0",
+                summary: "turned about its normal, -180 to 180",
+            },
+            SHIFT_X,
+            SHIFT_Y,
+            OptionInfo { name: "columns", default: "11", summary: "squares across, 2 to 100" },
+            OptionInfo { name: "rows", default: "8", summary: "squares down, 2 to 100" },
+            OptionInfo { name: "square_mm", default: "40", summary: "side of a square, 1 to 500" },
+        ],
+    },
+    SceneInfo {
+        name: "mesh",
+        summary: "a mesh from an OBJ, STL or PLY file",
+        options: &[
+            OptionInfo { name: "path", default: "", summary: "the file" },
+            OptionInfo {
+                name: "scale",
+                default: "1",
+                summary: "metres per unit of the file: 0.001 for millimetres",
+            },
+            OptionInfo {
+                name: "up",
+                default: "y",
+                summary: "the file's upward axis: y (front along z) or z (front along -y)",
+            },
+            distance("1.0"),
+            TILT,
+            TURN,
+            SHIFT_X,
+            SHIFT_Y,
             MATERIAL,
             ALBEDO,
         ],
@@ -115,6 +207,10 @@ pub struct SceneSpec {
     pub tilt_deg: f64,
     /// Turned about the vertical axis.
     pub turn_deg: f64,
+    /// Turned about its own normal.
+    pub roll_deg: f64,
+    /// Shifted to the right and down.
+    pub shift_m: [f64; 2],
     /// How its surface reflects.
     pub material: MaterialKind,
     /// Share of the light that is scattered back.
@@ -127,6 +223,12 @@ pub(crate) enum SceneKind {
     Plane,
     Sphere { plane_m: f64, radius_m: f64 },
     MovingPlane { speed_m_per_s: f64 },
+    Statue { rpm: f64 },
+    Part,
+    Panel,
+    Wires,
+    Board { texture: BoardTexture, rig_from_board: Option<Isometry3<f64>> },
+    Mesh { path: PathBuf, scale: f64, is_z_up: bool },
 }
 
 /// How surfaces reflect.
@@ -169,6 +271,23 @@ impl SceneSpec {
                 plane_m: given.number("plane_m", 0.3, 5.0)?,
                 radius_m: given.number("radius_mm", 1.0, 500.0)? * 1e-3,
             },
+            "statue" | "turntable" => SceneKind::Statue { rpm: given.number("rpm", -60.0, 60.0)? },
+            "part" => SceneKind::Part,
+            "panel" => SceneKind::Panel,
+            "wires" => SceneKind::Wires,
+            "board" => SceneKind::Board {
+                texture: BoardTexture::chessboard(
+                    given.number("columns", 2.0, 100.0)? as usize,
+                    given.number("rows", 2.0, 100.0)? as usize,
+                    given.number("square_mm", 1.0, 500.0)? * 1e-3,
+                ),
+                rig_from_board: None,
+            },
+            "mesh" => SceneKind::Mesh {
+                path: given.path()?,
+                scale: given.number("scale", 1e-9, 1e9)?,
+                is_z_up: given.choice("up", &["y", "z"])? == 1,
+            },
             "moving-plane" => SceneKind::MovingPlane {
                 speed_m_per_s: given.number("speed_mm_s", -1000.0, 1000.0)? * 1e-3,
             },
@@ -179,9 +298,33 @@ impl SceneSpec {
             distance_m: given.number("distance_m", 0.3, 5.0)?,
             tilt_deg: given.number("tilt_deg", -75.0, 75.0)?,
             turn_deg: given.number("turn_deg", -180.0, 180.0)?,
+            roll_deg: given.number("roll_deg", -180.0, 180.0)?,
+            shift_m: [
+                given.number("x_mm", -2000.0, 2000.0)? * 1e-3,
+                given.number("y_mm", -2000.0, 2000.0)? * 1e-3,
+            ],
             material: given.material()?,
             albedo: given.number("albedo", 0.01, 1.0)?,
         })
+    }
+}
+
+impl SceneSpec {
+    /// A printed target at a pose in the sensor's frame
+    /// (see [`SensorModel::left_from_rig`](super::SensorModel::left_from_rig)). A target that faces
+    /// the sensor upright has the identity rotation: its x is to the right, its y down.
+    #[must_use]
+    pub fn board(texture: BoardTexture, rig_from_board: Isometry3<f64>) -> Self {
+        Self {
+            kind: SceneKind::Board { texture, rig_from_board: Some(rig_from_board) },
+            distance_m: rig_from_board.translation.z,
+            tilt_deg: 0.0,
+            turn_deg: 0.0,
+            roll_deg: 0.0,
+            shift_m: [0.0; 2],
+            material: MaterialKind::Lambertian,
+            albedo: 0.8,
+        }
     }
 }
 
@@ -212,26 +355,31 @@ impl Given<'_> {
         })
     }
 
-    fn material(&self) -> Result<MaterialKind, WorldError> {
-        let Some((option, text)) = self.text("material") else {
-            return Ok(MaterialKind::Lambertian);
-        };
-        match text {
-            "lambertian" => Ok(MaterialKind::Lambertian),
-            "glossy" => Ok(MaterialKind::Glossy),
-            "metal" => Ok(MaterialKind::Metal),
-            _ => Err(WorldError::BadOption {
-                scene: self.info.name,
-                option,
-                value: text.into(),
-                expected: "lambertian, glossy or metal".into(),
-            }),
-        }
+    /// The index of the given word among `words`.
+    fn choice(&self, option: &str, words: &[&str]) -> Result<usize, WorldError> {
+        let Some((option, text)) = self.text(option) else { return Ok(0) };
+        words.iter().position(|w| *w == text).ok_or_else(|| WorldError::BadOption {
+            scene: self.info.name,
+            option,
+            value: text.into(),
+            expected: format!("one of {}", join(words.iter().copied())),
+        })
     }
 
-    #[allow(dead_code)]
-    fn path(&self) -> Option<PathBuf> {
-        self.text("path").map(|(_, text)| PathBuf::from(text))
+    fn material(&self) -> Result<MaterialKind, WorldError> {
+        let kinds = [MaterialKind::Lambertian, MaterialKind::Glossy, MaterialKind::Metal];
+        Ok(kinds[self.choice("material", &["lambertian", "glossy", "metal"])?])
+    }
+
+    fn path(&self) -> Result<PathBuf, WorldError> {
+        match self.text("path") {
+            Some((_, path)) if !path.is_empty() => Ok(path.into()),
+            _ => Err(WorldError::MissingOption {
+                scene: self.info.name,
+                option: "path",
+                expected: "an OBJ, STL or PLY file",
+            }),
+        }
     }
 }
 

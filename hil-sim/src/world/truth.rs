@@ -60,6 +60,15 @@ pub enum PrimitiveShape {
     },
 }
 
+/// The surface of an object as triangles, in the left camera's frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurfaceMesh {
+    /// Vertices.
+    pub vertices_left_m: Vec<Vector3<f64>>,
+    /// Triples of indices into the vertices.
+    pub triangles: Vec<[u32; 3]>,
+}
+
 /// Surfaces this much before a point still count as the point itself.
 const SAME_SURFACE_M: f64 = 2e-5;
 
@@ -136,6 +145,19 @@ impl<'a> Truth<'a> {
             }));
         }
         primitives
+    }
+
+    /// The surface of an object at a time, for comparing clouds with it. `None` for objects that are
+    /// not made of triangles (planes, spheres, the industrial part).
+    #[must_use]
+    pub fn mesh(&self, object: usize, time_ns: u64) -> Option<SurfaceMesh> {
+        let scene = &self.world.scene;
+        let triangles = scene.objects.get(object)?.shape.triangles()?;
+        let pose = scene.left_from_object(object, time_ns);
+        Some(SurfaceMesh {
+            vertices_left_m: triangles.vertices.iter().map(|v| transform_point(&pose, v)).collect(),
+            triangles: triangles.indices.clone(),
+        })
     }
 
     fn per_left_pixel<T: Copy + Send + Sync>(
