@@ -1,5 +1,8 @@
 //! The data path: camera frames with the camera's own sequence number and timestamp.
 
+#[cfg(target_os = "linux")]
+pub mod v4l2;
+
 use std::time::Duration;
 
 use crate::RawImage;
@@ -61,6 +64,53 @@ pub enum CameraError {
         expected: [usize; 2],
         /// [width, height] of the frame.
         got: [usize; 2],
+    },
+    /// The device node may not be opened.
+    #[error(
+        "the {side} camera's node {} may not be opened; install the udev rule (`stspp doctor`)",
+        .path.display()
+    )]
+    Permission {
+        /// Which.
+        side: Side,
+        /// The node.
+        path: std::path::PathBuf,
+    },
+    /// Another program streams from the camera.
+    #[error("the {side} camera ({}) is in use by another program; close it", .path.display())]
+    Busy {
+        /// Which.
+        side: Side,
+        /// The node.
+        path: std::path::PathBuf,
+    },
+    /// No pixel format of the camera holds grey values.
+    #[error("the {side} camera ({}) offers neither GREY, Y10, Y12, Y16 nor YUYV", .path.display())]
+    NoGreyFormat {
+        /// Which.
+        side: Side,
+        /// The node.
+        path: std::path::PathBuf,
+    },
+    /// The camera lacks a control that was asked for.
+    #[error("the {side} camera has no {name} control; leave that setting out")]
+    NoControl {
+        /// Which.
+        side: Side,
+        /// The control.
+        name: &'static str,
+    },
+    /// A control cannot have that value.
+    #[error("{name} of the {side} camera is {value}, allowed is {} to {}", .allowed[0], .allowed[1])]
+    ControlRange {
+        /// Which.
+        side: Side,
+        /// The control.
+        name: &'static str,
+        /// What was asked for, in the camera's units.
+        value: i32,
+        /// Least and largest value.
+        allowed: [i32; 2],
     },
     /// The operating system reports an error.
     #[error("{side} camera: {source}")]

@@ -1,0 +1,203 @@
+//! Which video nodes belong to which camera, and which cameras to which sensor, by where they hang on
+//! the USB tree. All of it is read from sysfs.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// A camera at a USB port.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UsbCamera {
+    /// Kernel name of its USB device: bus, then the ports on the way, such as `1-2.3`.
+    pub usb_path: String,
+    /// Product string, empty when it has none.
+    pub product: String,
+    /// Serial number, empty when it has none.
+    pub serial: String,
+    /// Vendor and product id.
+    pub ids: [u16; 2],
+    /// Speed in Mbit/s as the kernel states it.
+    pub speed_mbit_s: u32,
+    /// Its device nodes, lowest number first: pictures and, with a recent kernel, metadata.
+    pub nodes: Vec<PathBuf>,
+    /// Rate of the camera's clock, if its descriptors state one.
+    pub clock_hz: Option<u32>,
+}
+
+/// All USB cameras of this machine, in the order of their ports.
+pub fn usb_cameras() -> Vec<UsbCamera> {
+    usb_cameras_in(Path::new("/sys/class/video4linux"))
+}
+
+fn usb_cameras_in(class: &Path) -> Vec<UsbCamera> {
+    let mut nodes: Vec<(u32, PathBuf)> = fs::read_dir(class)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|entry| {
+            let number = entry.file_name().to_str()?.strip_prefix("video")?.parse().ok()?;
+            // The node's device is a USB interface; its parent is the USB device.
+            let interface = fs::canonicalize(entry.path().join("device")).ok()?;
+            Some((number, interface.parent()?.to_path_buf()))
+        })
+        .collect();
+    nodes.sort();
+    let mut cameras: Vec<UsbCamera> = Vec::new();
+    for (number, device) in nodes {
+        let Some(usb_path) = device.file_name().map(|n| n.to_string_lossy().into_owned()) else {
+            continue;
+        };
+        if !device.join("idVendor").exists() {
+            continue;
+        }
+        let node = PathBuf::from(format!("/dev/video{number}"));
+        if let Some(known) = cameras.iter_mut().find(|c| c.usb_path == usb_path) {
+            known.nodes.push(node);
+            continue;
+        }
+        let text = |name: &str| {
+            fs::read_to_string(device.join(name)).unwrap_or_default().trim().to_owned()
+        };
+        let id = |name: &str| u16::from_str_radix(&text(name), 16).unwrap_or(0);
+        let descriptors = fs::read(device.join("descriptors")).unwrap_or_default();
+        cameras.push(UsbCamera {
+            product: text("product"),
+            serial: text("serial"),
+            ids: [id("idVendor"), id("idProduct")],
+            speed_mbit_s: text("speed").parse().unwrap_or(0),
+            nodes: vec![node],
+            clock_hz: super::metadata::clock_hz(&descriptors),
+            usb_path,
+        });
+    }
+    cameras.sort_by_key(|c| port_numbers(&c.usb_path));
+    cameras
+}
+
+/// The cameras of a sensor.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SensorCameras {
+    /// One camera for each side.
+    Two {
+        /// Left.
+        left: UsbCamera,
+        /// Right.
+        right: UsbCamera,
+    },
+    /// One camera that delivers both pictures beside each other.
+    SideBySide(UsbCamera),
+}
+
+/// The cameras that hang nearest to the control interface at `control_usb_path`.
+///
+/// A sensor has a hub inside, so that its parts share all ports but the last. Of two cameras the one
+/// that says "left" or "right" in its product string is that; otherwise the lower port is left. A
+/// single camera is taken for one that delivers both pictures.
+///
+/// # Errors
+/// The number of cameras found, when that is neither one nor two.
+pub fn cameras_of(
+    control_usb_path: Option<&str>,
+    cameras: &[UsbCamera],
+) -> Result<SensorCameras, usize> {
+    let near = match control_usb_path {
+        Some(control) => {
+            let hub = hub_of(control);
+            cameras.iter().filter(|c| hub_of(&c.usb_path) == hub).collect::<Vec<_>>()
+        }
+        None => cameras.iter().collect(),
+    };
+    match near.as_slice() {
+        [one] => Ok(SensorCameras::SideBySide((*one).clone())),
+        [a, b] => {
+            let says =
+                |camera: &UsbCamera, side: &str| camera.product.to_ascii_lowercase().contains(side);
+            let swapped = says(a, "right") || says(b, "left");
+            let (left, right) = if swapped { (b, a) } else { (a, b) };
+            Ok(SensorCameras::Two { left: (*left).clone(), right: (*right).clone() })
+        }
+        other => Err(other.len()),
+    }
+}
+
+/// A USB path without its last port: `1-2.3` is at hub `1-2`, `1-2` at hub `1`.
+fn hub_of(usb_path: &str) -> &str {
+    usb_path.rsplit_once(['.', '-']).map_or("", |(hub, _)| hub)
+}
+
+fn port_numbers(usb_path: &str) -> Vec<u32> {
+    usb_path.split(['-', '.']).map(|number| number.parse().unwrap_or(u32::MAX)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn camera(usb_path: &str, product: &str) -> UsbCamera {
+        UsbCamera {
+            usb_path: usb_path.into(),
+            product: product.into(),
+            serial: String::new(),
+            ids: [0; 2],
+            speed_mbit_s: 480,
+            nodes: vec![],
+            clock_hz: None,
+        }
+    }
+
+    #[test]
+    fn only_cameras_at_the_sensors_hub_count() {
+        let all = [
+            camera("1-2.2", "IR"),
+            camera("1-2.3", "IR"),
+            camera("1-3", "webcam"),
+            camera("2-2.2", ""),
+        ];
+        let found = cameras_of(Some("1-2.1"), &all).unwrap();
+        assert_eq!(found, SensorCameras::Two { left: all[0].clone(), right: all[1].clone() });
+        assert_eq!(cameras_of(Some("2-2.1"), &all), Ok(SensorCameras::SideBySide(all[3].clone())));
+        assert_eq!(cameras_of(Some("4-1"), &all), Err(0));
+        assert_eq!(cameras_of(None, &all), Err(4));
+    }
+
+    #[test]
+    fn names_decide_the_sides_before_ports_do() {
+        let all = [camera("1-1", "Right IR"), camera("1-2", "Left IR")];
+        let found = cameras_of(Some("1-3"), &all).unwrap();
+        assert_eq!(found, SensorCameras::Two { left: all[1].clone(), right: all[0].clone() });
+    }
+
+    #[test]
+    fn ports_are_ordered_as_numbers() {
+        assert!(port_numbers("1-2.10") > port_numbers("1-2.9"));
+        assert_eq!(hub_of("1-2.3"), "1-2");
+        assert_eq!(hub_of("1-2"), "1");
+    }
+
+    #[test]
+    fn sysfs_is_read_as_the_kernel_lays_it_out() {
+        let folder = std::env::temp_dir().join(format!("stspp-sysfs-{}", std::process::id()));
+        let device = folder.join("devices/usb1/1-2");
+        let class = folder.join("class");
+        for number in [0, 1] {
+            let node = class.join(format!("video{number}"));
+            fs::create_dir_all(&node).unwrap();
+            let interface = device.join("1-2:1.0");
+            fs::create_dir_all(&interface).unwrap();
+            std::os::unix::fs::symlink(&interface, node.join("device")).unwrap();
+        }
+        for (name, text) in [
+            ("idVendor", "1209\n"),
+            ("idProduct", "5753\n"),
+            ("product", "left\n"),
+            ("speed", "480\n"),
+        ] {
+            fs::write(device.join(name), text).unwrap();
+        }
+        let cameras = usb_cameras_in(&class);
+        fs::remove_dir_all(&folder).unwrap();
+        assert_eq!(cameras.len(), 1);
+        assert_eq!(cameras[0].ids, [0x1209, 0x5753]);
+        assert_eq!(cameras[0].nodes, [PathBuf::from("/dev/video0"), "/dev/video1".into()]);
+        assert_eq!((cameras[0].usb_path.as_str(), cameras[0].speed_mbit_s), ("1-2", 480));
+    }
+}
