@@ -1,7 +1,8 @@
 //! Events on their way to the host.
 //!
-//! Bounded: when the link is slower than the events, the newest is dropped and counted, and its
-//! sequence number with it, so that the host sees the gap.
+//! Bounded: when the link is slower than the events, one is dropped and counted, and its sequence
+//! number with it, so that the host sees the gap. A trigger that finds no room is the one that goes;
+//! faults and changes of state push the oldest out instead.
 
 use heapless::Deque;
 use stspp_protocol::message::Event;
@@ -30,13 +31,20 @@ impl Outbox {
         Self { waiting: Deque::new(), next_seq: 0, dropped: 0 }
     }
 
-    /// Numbers an event and queues it, or drops and counts it.
+    /// Numbers an event and queues it, or drops and counts one.
     pub fn push(&mut self, event: impl Into<Event>) {
         let seq = self.next_seq;
         self.next_seq = seq.wrapping_add(1);
-        if self.waiting.push_back((seq, event.into())).is_err() {
+        let event = event.into();
+        if self.waiting.is_full() {
             self.dropped = self.dropped.wrapping_add(1);
+            if matches!(event, Event::TriggerEvent(_)) {
+                return;
+            }
+            self.waiting.pop_front();
         }
+        // There is room now.
+        let _ = self.waiting.push_back((seq, event));
     }
 
     /// Takes the oldest event and its sequence number.
