@@ -17,7 +17,7 @@ pub enum Level {
     Neon,
     /// x86-64 AVX2 with FMA, 256 bits.
     Avx2,
-    /// x86-64 AVX-512 F, BW, VL, DQ with VPOPCNTDQ and BITALG (Ice Lake, Zen 4 and later), 512 bits.
+    /// x86-64 AVX-512 F, BW, VL, DQ with VPOPCNTDQ, BITALG and VNNI (Ice Lake, Zen 4 and later), 512 bits.
     Avx512,
 }
 
@@ -52,9 +52,15 @@ impl Level {
         Ok(Level::available().filter(|l| l.rank() <= rank).last().unwrap_or(Level::Scalar))
     }
 
+<<<<<<< HEAD
     /// This level, or the best one that this machine runs where it cannot run this one.
     pub fn usable(self) -> Level {
         if self.rank() <= Level::best().rank() && self.runs_here() { self } else { Level::best() }
+=======
+    /// This level where the machine can run it, else [`Level::Scalar`]: kernels rely on it.
+    pub(crate) fn trusted(self) -> Level {
+        Level::available().find(|l| *l == self).unwrap_or(Level::Scalar)
+>>>>>>> fe0d355 (Add the dense least-squares fit: kernels, warp, moments, masked refit, and a synthetic scene)
     }
 
     /// Name as [`LEVEL_VARIABLE`] takes it.
@@ -92,6 +98,7 @@ impl Level {
                     && is_x86_feature_detected!("avx512dq")
                     && is_x86_feature_detected!("avx512vpopcntdq")
                     && is_x86_feature_detected!("avx512bitalg")
+                    && is_x86_feature_detected!("avx512vnni")
             }
             #[allow(unreachable_patterns)]
             _ => false,

@@ -7,10 +7,13 @@
 pub mod bspline;
 pub mod census;
 pub mod check;
+pub mod coarse;
 pub mod cost;
+pub mod dense;
 pub mod error;
 pub mod icgn;
 pub mod image;
+mod lanes;
 pub mod level;
 pub mod matched;
 pub mod parabola;
@@ -20,6 +23,7 @@ pub mod pipeline;
 mod retry;
 pub mod search;
 pub mod stack;
+pub mod synthetic;
 pub mod wta;
 pub mod zncc;
 

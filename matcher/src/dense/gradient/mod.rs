@@ -1,0 +1,118 @@
+//! The static pass over one row of the left stack: gradients, and the sums over time that do not
+//! depend on the disparity.
+//!
+//! Grey values and gradients are brought to 1/16 of an 8-bit grey level (per px), so that sums of
+//! squares over 16 frames fit 32 bits, and kept as pairs: the low half of a word is an even frame,
+//! the high half the odd one after it.
+
+mod scalar;
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+
+use super::kernels::Kernels;
+use crate::{Level, Sample};
+
+/// Reach of the gradient's kernel on both sides.
+pub(crate) const REACH: usize = 3;
+
+/// Where a row's results go; each slice starts at the row's first pixel.
+pub(crate) struct Static<'a> {
+    /// Gradient pairs, `stride` words per pair of frames.
+    pub gradient: &'a mut [i32],
+    /// Grey value pairs, laid out likewise.
+    pub grey: &'a mut [i32],
+    /// Words per pair of frames.
+    pub stride: usize,
+    /// Sum over time of the squared gradient.
+    pub s: &'a mut [f32],
+    /// Sum over time of gradient times grey value.
+    pub il: &'a mut [f32],
+    /// Sum over time of the gradient.
+    pub i: &'a mut [f32],
+    /// Sum over time of the grey value.
+    pub l: &'a mut [f32],
+    /// Sum over time of the squared grey value.
+    pub ll: &'a mut [f32],
+}
+
+/// Fills `out` for pixels `x0..x0 + len` of the rows in `left`: an even number of rows of the
+/// image's width (a last odd frame is followed by a row of zeros). Pixels beyond the image get
+/// zeros, and so do gradients within [`REACH`] of its sides.
+pub(crate) fn static_row(
+    level: Level,
+    left: &[&[Sample]],
+    x0: usize,
+    len: usize,
+    out: &mut Static<'_>,
+) {
+    let width = left[0].len();
+    assert!(left.len().is_multiple_of(2) && left.iter().all(|r| r.len() == width));
+    let pairs = left.len() / 2;
+    assert!(len <= out.stride && out.gradient.len() >= pairs * out.stride);
+    assert!(out.grey.len() >= pairs * out.stride);
+    for map in [&out.s, &out.il, &out.i, &out.l, &out.ll] {
+        assert!(map.len() >= len);
+    }
+    let kernels = Kernels::get();
+    let block = match level {
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => 32,
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 => 16,
+        _ => return scalar::pixels(kernels, left, x0, 0..len, out),
+    };
+    // Whole blocks whose kernel stays inside the image, counted from `from`.
+    let from = REACH.saturating_sub(x0).min(len);
+    let end = width.saturating_sub(REACH).saturating_sub(x0).min(len);
+    let blocks = end.saturating_sub(from) / block;
+    let to = from + blocks * block;
+    scalar::pixels(kernels, left, x0, 0..from, out);
+    match level {
+        // SAFETY: trusted levels are the processor's; blocks lie within rows and outputs as checked
+        // above, with REACH samples on both sides.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => unsafe { avx512::blocks(kernels, left, x0, from, blocks, out) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 => unsafe { avx2::blocks(kernels, left, x0, from, blocks, out) },
+        _ => {}
+    }
+    scalar::pixels(kernels, left, x0, to..len, out);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::synthetic::Random;
+
+    type Maps = (Vec<i32>, Vec<i32>, [Vec<f32>; 5]);
+
+    fn run(level: Level, rows: &[Vec<Sample>], x0: usize, len: usize) -> Maps {
+        let left: Vec<&[Sample]> = rows.iter().map(|r| &r[..]).collect();
+        let mut words = (vec![0; rows.len() / 2 * len], vec![0; rows.len() / 2 * len]);
+        let mut maps: [Vec<f32>; 5] = std::array::from_fn(|_| vec![0.0; len]);
+        let [s, il, i, l, ll] = &mut maps;
+        let (gradient, grey) = (&mut words.0[..], &mut words.1[..]);
+        let mut out = Static { gradient, grey, stride: len, s, il, i, l, ll };
+        static_row(level, &left, x0, len, &mut out);
+        (words.0, words.1, maps)
+    }
+
+    #[test]
+    fn levels_are_bit_equal() {
+        let mut random = Random::new(3);
+        for (width, x0, len) in [(131, 0, 131), (131, 40, 91), (131, 40, 128), (5, 0, 16), (64, 1, 64)]
+        {
+            let rows: Vec<Vec<Sample>> = (0..6)
+                .map(|_| (0..width).map(|_| (random.bits() % 16_321) as i16).collect())
+                .collect();
+            let want = run(Level::Scalar, &rows, x0, len);
+            for level in Level::available() {
+                assert_eq!(run(level, &rows, x0, len), want, "{level} {width} {x0} {len}");
+            }
+        }
+    }
+}

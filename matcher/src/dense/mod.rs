@@ -1,0 +1,177 @@
+//! Dense least squares: the estimate of Stereo-DIC (paper eq 10-19) for every pixel at a cost that
+//! does not depend on the window.
+//!
+//! With L, R the rectified stacks, I = dL/dx, w the current disparity and g_t = R_t(x - w, y), the
+//! fit of the disparity itself in a window is
+//!
+//! ```text
+//! S = sum_t I_t^2        b = sum_t I_t [(L_t - mean L) - norm(L)/norm(g) (g_t - mean g)]
+//! q = S w - (1 - dw/dx) b
+//! d = first component of M^-1 sum_window phi q,   M = sum_window S phi phi^T
+//! ```
+//!
+//! All windows share one warp and separable sums. phi is 1, x, y or 1, x, y, x^2, xy, y^2.
+
+pub(crate) mod gradient;
+pub mod kernels;
+pub(crate) mod moments;
+pub(crate) mod normalise;
+pub(crate) mod refit;
+pub(crate) mod solve;
+pub(crate) mod tile;
+pub(crate) mod warp;
+
+use std::sync::Mutex;
+
+use rayon::prelude::*;
+
+use crate::{Image, Level, Sample, ShapeFunction, StereoStack};
+use solve::Fits;
+use tile::{Job, Output, Tile};
+
+/// Columns a tile fits: its rows stay in a core's second-level cache.
+const STRIP: usize = 640;
+/// Rows of a task.
+const BAND: usize = 128;
+
+/// The dense fit; keeps its buffers between frames.
+#[derive(Debug)]
+pub struct DenseFit {
+    level: Level,
+    radius: usize,
+    shape: ShapeFunction,
+    surface_px: f32,
+    tiles: Vec<Mutex<Tile>>,
+    zero: Image<Sample>,
+}
+
+/// Maps of a dense fit on the left canvas; NaN is invalid.
+#[derive(Debug, Clone)]
+pub struct DenseMaps {
+    /// Disparity of first order in px.
+    pub first_px: Image<f32>,
+    /// Of second order; not written for [`ShapeFunction::First`].
+    pub second_px: Image<f32>,
+    /// ZNCC of the window.
+    pub zncc: Image<f32>,
+}
+
+impl DenseMaps {
+    /// Empty maps.
+    pub fn new(width: usize, height: usize) -> Self {
+        let map = || Image::new(width, height, f32::NAN);
+        Self { first_px: map(), second_px: map(), zncc: map() }
+    }
+}
+
+impl DenseFit {
+    /// A fit with windows of 2 `radius` + 1 pixels a side; `radius` is brought to 2..=8.
+    pub fn new(level: Level, radius: usize, shape: ShapeFunction, surface_px: f32) -> Self {
+        Self {
+            level: level.trusted(),
+            radius: radius.clamp(2, 8),
+            shape,
+            surface_px,
+            tiles: Vec::new(),
+            zero: Image::new(0, 0, 0),
+        }
+    }
+
+    /// Fits the disparity around `start` (NaN is invalid), whose depth steps are marked in `step`
+    /// (see [`mark_steps`]). Sizes must be those of the checked stack; `out` is resized.
+    pub fn fit(
+        &mut self,
+        stack: &StereoStack<'_>,
+        start: &Image<f32>,
+        step: &Image<u8>,
+        out: &mut DenseMaps,
+    ) {
+        let (width, height) = (stack.width(), stack.height());
+        if (out.first_px.width(), out.first_px.height()) != (width, height) {
+            *out = DenseMaps::new(width, height);
+        }
+        if (self.zero.width(), self.zero.height()) != (width, height) {
+            self.zero = Image::new(width, height, 0);
+        }
+        let threads = rayon::current_num_threads().max(1);
+        self.tiles.resize_with(threads.max(self.tiles.len()), Mutex::default);
+        let frames = stack.frames();
+        let mut left = [&self.zero; 16];
+        let mut right = [&self.zero; 16];
+        left[..frames].copy_from_slice(stack.left);
+        right[..frames].copy_from_slice(stack.right);
+        let even = frames.next_multiple_of(2);
+        let job = Job {
+            level: self.level,
+            left: &left[..even],
+            right: &right[..even],
+            frames,
+            start,
+            step,
+            radius: self.radius,
+            fits: if self.shape == ShapeFunction::First { Fits::First } else { Fits::Both },
+            surface_px: self.surface_px,
+            origin: origin(start),
+        };
+        let tiles = &self.tiles;
+        let rows = width * BAND;
+        let DenseMaps { first_px, second_px, zncc } = out;
+        first_px
+            .as_mut_slice()
+            .par_chunks_mut(rows)
+            .zip(second_px.as_mut_slice().par_chunks_mut(rows))
+            .zip(zncc.as_mut_slice().par_chunks_mut(rows))
+            .enumerate()
+            .for_each(|(band, ((first, second), zncc))| {
+                let thread = rayon::current_thread_index().unwrap_or(0) % tiles.len();
+                let mut tile = tiles[thread].lock().unwrap_or_else(|e| e.into_inner());
+                let mut out = Output { first, second, zncc };
+                let strips = width.div_ceil(STRIP);
+                for strip in 0..strips {
+                    let columns = (width * strip / strips, width * (strip + 1) / strips);
+                    tile.run(&job, columns, band * BAND, &mut out);
+                }
+            });
+    }
+}
+
+/// A whole number near the mean disparity, subtracted inside for precision.
+fn origin(start: &Image<f32>) -> f32 {
+    let (mut sum, mut n) = (0.0f64, 0u32);
+    for &v in start.as_slice().iter().step_by(61).filter(|v| v.is_finite()) {
+        sum += f64::from(v);
+        n += 1;
+    }
+    if n == 0 { 0.0 } else { (sum / f64::from(n)).round() as f32 }
+}
+
+/// Marks the pixels whose window of `radius` holds a valid disparity more than `limit` px from their
+/// own.
+pub fn mark_steps(start: &Image<f32>, radius: usize, limit: f32, out: &mut Image<u8>) {
+    let (width, height) = (start.width(), start.height());
+    if (out.width(), out.height()) != (width, height) {
+        *out = Image::new(width, height, 0);
+    }
+    let data = out.as_mut_slice();
+    data.par_chunks_mut(width.max(1)).enumerate().for_each_init(
+        || [vec![0.0f32; width], vec![0.0f32; width]],
+        |[low, high], (y, marks)| {
+            low.fill(f32::INFINITY);
+            high.fill(f32::NEG_INFINITY);
+            for row in y.saturating_sub(radius)..(y + radius + 1).min(height) {
+                for ((lo, hi), &v) in low.iter_mut().zip(high.iter_mut()).zip(start.row(row)) {
+                    // NaN loses either comparison.
+                    *lo = if v < *lo { v } else { *lo };
+                    *hi = if v > *hi { v } else { *hi };
+                }
+            }
+            let own = start.row(y);
+            for x in 0..width {
+                let window = x.saturating_sub(radius)..(x + radius + 1).min(width);
+                let lo = low[window.clone()].iter().copied().fold(f32::INFINITY, f32::min);
+                let hi = high[window].iter().copied().fold(f32::NEG_INFINITY, f32::max);
+                marks[x] = u8::from(own[x] - lo > limit || hi - own[x] > limit);
+            }
+        },
+    );
+}

@@ -1,0 +1,196 @@
+//! The fit at depth steps: window pixels take part only where their disparity is near the centre's.
+
+use super::{
+    moments::{PAD, Powers},
+    solve::{Fits, first_matrix, inverse_row, second_matrix},
+};
+use crate::{
+    Level,
+    lanes::{Lanes, WIDEST, dispatch},
+};
+
+/// Window rows around the output row, 2 radius + 1 each (padded rows).
+pub(crate) struct Window<'a> {
+    /// Squared gradients; zero where a pixel takes no part.
+    pub s: &'a [&'a [f32]],
+    /// q of [`super::normalise::residual_row`].
+    pub q: &'a [&'a [f32]],
+    /// Disparity that tells the surfaces apart; NaN where invalid.
+    pub w: &'a [&'a [f32]],
+    /// Largest difference from the centre's disparity.
+    pub limit: f32,
+}
+
+/// Overwrites the disparities of the pixels where `flagged` (an unpadded row) is not zero.
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn refit_row(
+    level: Level,
+    window: &Window<'_>,
+    flagged: &[f32],
+    radius: usize,
+    powers: &Powers,
+    len: usize,
+    fits: Fits,
+    out: &mut [&mut [f32]],
+) {
+    let padded = len + 2 * PAD;
+    assert!(radius <= PAD && len.is_multiple_of(WIDEST) && flagged.len() >= len);
+    for rows in [window.s, window.q, window.w] {
+        assert!(rows.len() == 2 * radius + 1 && rows.iter().all(|r| r.len() >= padded));
+    }
+    assert!(out.iter().all(|o| o.len() >= padded));
+    assert!(out.len() >= if fits == Fits::First { 1 } else { 2 });
+    if fits == Fits::First {
+        dispatch!(
+            level,
+            refit_first(
+                window: &Window<'_> = window,
+                flagged: &[f32] = flagged,
+                radius: usize = radius,
+                powers: &Powers = powers,
+                len: usize = len,
+                out: &mut [&mut [f32]] = out,
+            )
+        );
+    } else {
+        dispatch!(
+            level,
+            refit_both(
+                window: &Window<'_> = window,
+                flagged: &[f32] = flagged,
+                radius: usize = radius,
+                powers: &Powers = powers,
+                len: usize = len,
+                out: &mut [&mut [f32]] = out,
+            )
+        );
+    }
+}
+
+#[inline(always)]
+fn refit_first<V: Lanes>(
+    window: &Window<'_>,
+    flagged: &[f32],
+    radius: usize,
+    powers: &Powers,
+    len: usize,
+    out: &mut [&mut [f32]],
+) {
+    for at in (0..len).step_by(V::COUNT) {
+        // SAFETY: `at + COUNT <= len`.
+        let flag = V::splat(0.5).lt(unsafe { V::load(flagged.as_ptr().add(at)) });
+        if !V::any(flag) {
+            continue;
+        }
+        // SAFETY: checked by `refit_row`.
+        let (s, q) = unsafe { sums::<V, 3, 2>(window, radius, powers, PAD + at) };
+        let first = first_fit(&s, &q);
+        // SAFETY: as above.
+        unsafe { store(flag, first, out[0], PAD + at) };
+    }
+}
+
+#[inline(always)]
+fn refit_both<V: Lanes>(
+    window: &Window<'_>,
+    flagged: &[f32],
+    radius: usize,
+    powers: &Powers,
+    len: usize,
+    out: &mut [&mut [f32]],
+) {
+    for at in (0..len).step_by(V::COUNT) {
+        // SAFETY: `at + COUNT <= len`.
+        let flag = V::splat(0.5).lt(unsafe { V::load(flagged.as_ptr().add(at)) });
+        if !V::any(flag) {
+            continue;
+        }
+        // SAFETY: checked by `refit_row`.
+        let (s, q) = unsafe { sums::<V, 5, 3>(window, radius, powers, PAD + at) };
+        let first = first_fit(&s, &q);
+        let a = inverse_row(second_matrix(|a, b| s[a][b]));
+        let slopes = a[0].mul_add(q[1][0], a[1].mul_add(q[0][1], a[5].mul(q[0][0])));
+        let curves = a[3].mul_add(q[1][1], a[4].mul(q[0][2]));
+        let second = a[2].mul_add(q[2][0], slopes.add(curves));
+        // SAFETY: as above.
+        unsafe {
+            store(flag, first, out[0], PAD + at);
+            store(flag, second, out[1], PAD + at);
+        }
+    }
+}
+
+#[inline(always)]
+fn first_fit<V: Lanes, const K: usize, const L: usize>(s: &[[V; K]; K], q: &[[V; L]; L]) -> V {
+    let a = inverse_row(first_matrix(|a, b| s[a][b]));
+    a[0].mul_add(q[1][0], a[1].mul_add(q[0][1], a[2].mul(q[0][0])))
+}
+
+/// # Safety
+/// `i + COUNT` lies within `row`.
+#[inline(always)]
+unsafe fn store<V: Lanes>(flag: V::Mask, value: V, row: &mut [f32], i: usize) {
+    // SAFETY: the caller's promise.
+    unsafe {
+        let to = row.as_mut_ptr().add(i);
+        V::select(flag, value, V::load(to)).store(to);
+    }
+}
+
+/// Moments of S up to degree K - 1 and of q up to L - 1 over the centre's surface: `s[a][b]` is that
+/// of x^a y^b.
+///
+/// # Safety
+/// `i - radius` and `i + radius + COUNT` lie within the rows, of which there are 2 radius + 1.
+#[inline(always)]
+unsafe fn sums<V: Lanes, const K: usize, const L: usize>(
+    window: &Window<'_>,
+    radius: usize,
+    powers: &Powers,
+    i: usize,
+) -> ([[V; K]; K], [[V; L]; L]) {
+    let zero = V::splat(0.0);
+    let limit = V::splat(window.limit);
+    // SAFETY: the caller's promise, here and below.
+    let load = |row: &[f32], at: usize| unsafe { V::load(row.as_ptr().add(at)) };
+    let centre = load(window.w[radius], i);
+    let (mut s, mut q) = ([[zero; K]; K], [[zero; L]; L]);
+    for row in 0..2 * radius + 1 {
+        let (mut sh, mut qh) = ([zero; K], [zero; L]);
+        for column in 0..2 * radius + 1 {
+            let at = i - radius + column;
+            let near = load(window.w[row], at).sub(centre).abs().lt(limit);
+            let sv = V::select(near, load(window.s[row], at), zero);
+            let qv = V::select(near, load(window.q[row], at), zero);
+            for k in 0..K {
+                sh[k] = sv.mul_add(V::splat(signed(powers, k, column, radius)), sh[k]);
+            }
+            for k in 0..L {
+                qh[k] = qv.mul_add(V::splat(signed(powers, k, column, radius)), qh[k]);
+            }
+        }
+        for a in 0..K {
+            for b in 0..K - a {
+                s[a][b] = sh[a].mul_add(V::splat(signed(powers, b, row, radius)), s[a][b]);
+            }
+        }
+        for a in 0..L {
+            for b in 0..L - a {
+                q[a][b] = qh[a].mul_add(V::splat(signed(powers, b, row, radius)), q[a][b]);
+            }
+        }
+    }
+    (s, q)
+}
+
+/// ((at - radius) / radius)^k
+#[inline(always)]
+fn signed(powers: &Powers, k: usize, at: usize, radius: usize) -> f32 {
+    if at >= radius {
+        powers[k][at - radius]
+    } else if k % 2 == 0 {
+        powers[k][radius - at]
+    } else {
+        -powers[k][radius - at]
+    }
+}

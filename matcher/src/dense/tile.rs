@@ -1,0 +1,472 @@
+//! The dense fit of one strip of a band of rows, row by row: every row passes the stages below, each
+//! a window radius behind the one before, so that all intermediate rows stay in the cache.
+//!
+//! ```text
+//! y      gradients and sums of the left row, warp at the start w0
+//! y - r  gain and offset, q, horizontal moments of q and S
+//! y - 2r M^-1, first fit w1, warp at w1, q again with moments
+//! y - 3r second fit, ZNCC
+//! ```
+
+use super::{
+    gradient::{Static, static_row},
+    moments::{PAD, Powers, box_sum, horizontal, powers},
+    normalise::{Terms, Windowed, gain_row, product_row, residual_row, restart_row, zncc_row},
+    refit::{Window, refit_row},
+    solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
+    warp::{Source, Warped, warp_row},
+};
+use crate::{Image, Level, Sample};
+
+/// What all tiles of a frame share.
+pub(crate) struct Job<'a> {
+    pub level: Level,
+    /// Left images, an even number.
+    pub left: &'a [&'a Image<Sample>],
+    /// Right images, likewise.
+    pub right: &'a [&'a Image<Sample>],
+    /// Number of frames that are not padding.
+    pub frames: usize,
+    /// Starting disparities; NaN is invalid.
+    pub start: &'a Image<f32>,
+    /// Non-zero where a window holds a depth step.
+    pub step: &'a Image<u8>,
+    pub radius: usize,
+    pub fits: Fits,
+    /// Largest difference of a window pixel from the centre at steps.
+    pub surface_px: f32,
+    /// Subtracted from disparities for precision.
+    pub origin: f32,
+}
+
+/// The rows a tile writes: full image rows, of which it fills the columns it was asked for.
+pub(crate) struct Output<'a> {
+    pub first: &'a mut [f32],
+    pub second: &'a mut [f32],
+    pub zncc: &'a mut [f32],
+}
+
+/// Padded rows by image row, the last `depth` of them kept.
+#[derive(Debug, Default)]
+struct Ring {
+    data: Vec<f32>,
+    stride: usize,
+    depth: usize,
+}
+
+impl Ring {
+    fn resize(&mut self, stride: usize, depth: usize) {
+        if (self.stride, self.depth) != (stride, depth) {
+            self.data.clear();
+            self.data.resize(stride * depth, 0.0);
+            (self.stride, self.depth) = (stride, depth);
+        }
+        self.data.fill(0.0);
+    }
+
+    fn offset(&self, y: isize) -> usize {
+        y.rem_euclid(self.depth as isize) as usize * self.stride
+    }
+
+    fn row(&self, y: isize) -> &[f32] {
+        &self.data[self.offset(y)..][..self.stride]
+    }
+
+    fn row_mut(&mut self, y: isize) -> &mut [f32] {
+        let at = self.offset(y);
+        &mut self.data[at..][..self.stride]
+    }
+
+    /// The row without its pads.
+    fn inner_mut(&mut self, y: isize) -> &mut [f32] {
+        let stride = self.stride;
+        &mut self.row_mut(y)[PAD..stride - PAD]
+    }
+}
+
+/// Most rows of a window.
+const ROWS: usize = 17;
+
+/// Calls `work` with the 2 radius + 1 rows of `ring` around `y`.
+fn around<T>(ring: &Ring, y: isize, radius: usize, work: impl FnOnce(&[&[f32]]) -> T) -> T {
+    let rows: [&[f32]; ROWS] =
+        std::array::from_fn(|j| ring.row(y - radius as isize + j.min(2 * radius) as isize));
+    work(&rows[..2 * radius + 1])
+}
+
+/// The rows of several rings around `y`.
+fn around_all<const K: usize, T>(
+    rings: &[Ring; K],
+    y: isize,
+    radius: usize,
+    work: impl FnOnce([&[&[f32]]; K]) -> T,
+) -> T {
+    let rows: [[&[f32]; ROWS]; K] = std::array::from_fn(|k| {
+        std::array::from_fn(|j| rings[k].row(y - radius as isize + j.min(2 * radius) as isize))
+    });
+    work(std::array::from_fn(|k| &rows[k][..2 * radius + 1]))
+}
+
+/// Buffers of a tile, kept between tiles.
+#[derive(Debug, Default)]
+pub(crate) struct Tile {
+    len: usize,
+    words: usize,
+    gradient: Vec<i32>,
+    grey: Vec<i32>,
+    column: Vec<f32>,
+    flagged: Vec<f32>,
+    powers: Powers,
+    w0: Ring,
+    /// Static sums.
+    s: Ring,
+    il: Ring,
+    i: Ring,
+    l: Ring,
+    ll: Ring,
+    /// The static sums of grey values where the first warp is valid.
+    l_used: Ring,
+    ll_used: Ring,
+    first: Pass,
+    ratio: Ring,
+    offset: Ring,
+    s_used: Ring,
+    hs: [Ring; 5],
+    inverse: [Ring; FIRST + SECOND],
+    w1: Ring,
+    second: Pass,
+    /// Windowed sums n, l, ll, g, gg of the first pass.
+    sums: [Ring; 5],
+    /// Windowed sums g, gg, lg of the second pass.
+    sums_again: [Ring; 3],
+    fit: [Ring; 2],
+    zncc: Ring,
+}
+
+/// A warp's terms, and q with its horizontal moments.
+#[derive(Debug, Default)]
+struct Pass {
+    at: Ring,
+    valid: Ring,
+    ig: Ring,
+    g: Ring,
+    gg: Ring,
+    lg: Ring,
+    q: Ring,
+    hq: [Ring; 3],
+}
+
+impl Pass {
+    fn resize(&mut self, stride: usize, window: usize) {
+        for ring in [&mut self.at, &mut self.valid, &mut self.ig, &mut self.g, &mut self.gg] {
+            ring.resize(stride, window);
+        }
+        for ring in [&mut self.lg, &mut self.q].into_iter().chain(&mut self.hq) {
+            ring.resize(stride, window);
+        }
+    }
+
+    fn warped(&mut self, y: isize) -> Warped<'_> {
+        Warped {
+            at: self.at.inner_mut(y),
+            valid: self.valid.inner_mut(y),
+            ig: self.ig.inner_mut(y),
+            g: self.g.inner_mut(y),
+            gg: self.gg.inner_mut(y),
+            lg: self.lg.inner_mut(y),
+        }
+    }
+
+    fn clear(&mut self, y: isize) {
+        for ring in [&mut self.at, &mut self.valid, &mut self.ig, &mut self.g, &mut self.gg] {
+            ring.row_mut(y).fill(0.0);
+        }
+        self.lg.row_mut(y).fill(0.0);
+    }
+}
+
+impl Tile {
+    fn resize(&mut self, len: usize, radius: usize, pairs: usize) {
+        let stride = len + 2 * PAD;
+        let window = 2 * radius + 1;
+        self.len = len;
+        self.words = pairs * len;
+        self.gradient.resize(self.words * window, 0);
+        self.grey.resize(self.words * window, 0);
+        self.column.clear();
+        self.column.resize(stride, 0.0);
+        self.flagged.resize(len, 0.0);
+        self.powers = powers(radius);
+        for ring in [&mut self.w0, &mut self.s_used] {
+            ring.resize(stride, 3 * radius + 1);
+        }
+        for ring in [&mut self.s, &mut self.il, &mut self.i, &mut self.l, &mut self.ll] {
+            ring.resize(stride, window);
+        }
+        for ring in [&mut self.l_used, &mut self.ll_used, &mut self.w1] {
+            ring.resize(stride, window);
+        }
+        for ring in self.hs.iter_mut().chain(&mut self.sums) {
+            ring.resize(stride, window);
+        }
+        for ring in [&mut self.ratio, &mut self.offset].into_iter().chain(&mut self.inverse) {
+            ring.resize(stride, radius + 1);
+        }
+        self.first.resize(stride, window);
+        self.second.resize(stride, window);
+        self.zncc.resize(stride, 1);
+        for ring in self.sums_again.iter_mut().chain(&mut self.fit) {
+            ring.resize(stride, 1);
+        }
+    }
+
+    /// Fits columns `x_from..x_to` of the rows from `y_from`, where `out` holds exactly the rows to
+    /// fit, at full width.
+    pub(crate) fn run(
+        &mut self,
+        job: &Job<'_>,
+        (x_from, x_to): (usize, usize),
+        y_from: usize,
+        out: &mut Output<'_>,
+    ) {
+        let (width, height) = (job.start.width(), job.start.height());
+        let rows = out.first.len() / width;
+        let r = job.radius as isize;
+        let halo = 3 * job.radius;
+        let x0 = x_from.saturating_sub(halo);
+        let x1 = (x_to + halo).min(width);
+        let len = (x1 - x0).next_multiple_of(32);
+        self.resize(len, job.radius, job.left.len() / 2);
+        let (top, end) = (y_from as isize, (y_from + rows) as isize);
+        let inside = |y: isize| (0..height as isize).contains(&y);
+        for y in top - 3 * r..end + 3 * r {
+            self.enter(job, y, (x0, x1), inside(y));
+            if y - r >= top - 2 * r {
+                self.normalise(job, y - r);
+            }
+            if y - 2 * r >= top - r {
+                self.first_fit(job, y - 2 * r, x0, inside(y - 2 * r));
+            }
+            let y3 = y - 3 * r;
+            if y3 >= top {
+                self.second_fit(job, y3, (x0, x1));
+                let from = (y3 - top) as usize * width;
+                let columns = x_from - x0 + PAD..x_to - x0 + PAD;
+                let maps = [
+                    (&mut *out.first, &self.fit[0], job.origin),
+                    (&mut *out.second, &self.fit[1], job.origin),
+                    (&mut *out.zncc, &self.zncc, 0.0),
+                ];
+                for (to, ring, origin) in maps {
+                    let values = &ring.row(y3)[columns.clone()];
+                    for (to, v) in to[from + x_from..from + x_to].iter_mut().zip(values) {
+                        *to = v + origin;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Words of row `y` in the pair buffers.
+    fn words_at(&self, y: isize, radius: usize) -> std::ops::Range<usize> {
+        let slot = y.rem_euclid(2 * radius as isize + 1) as usize;
+        slot * self.words..(slot + 1) * self.words
+    }
+
+    /// Static sums and first warp of row `y`.
+    fn enter(&mut self, job: &Job<'_>, y: isize, (x0, x1): (usize, usize), inside: bool) {
+        let w0 = self.w0.row_mut(y);
+        w0.fill(f32::NAN);
+        if !inside {
+            for ring in [&mut self.s, &mut self.il, &mut self.i, &mut self.l, &mut self.ll] {
+                ring.row_mut(y).fill(0.0);
+            }
+            for ring in [&mut self.l_used, &mut self.ll_used] {
+                ring.row_mut(y).fill(0.0);
+            }
+            self.first.clear(y);
+            return;
+        }
+        w0[PAD..PAD + x1 - x0].copy_from_slice(&job.start.row(y as usize)[x0..x1]);
+        let words = self.words_at(y, job.radius);
+        let left = image_rows(job.left, y);
+        let mut out = Static {
+            gradient: &mut self.gradient[words.clone()],
+            grey: &mut self.grey[words.clone()],
+            stride: self.len,
+            s: self.s.inner_mut(y),
+            il: self.il.inner_mut(y),
+            i: self.i.inner_mut(y),
+            l: self.l.inner_mut(y),
+            ll: self.ll.inner_mut(y),
+        };
+        static_row(job.level, &left[..job.left.len()], x0, self.len, &mut out);
+        let right = image_rows(job.right, y);
+        let source = Source {
+            right: &right[..job.right.len()],
+            x0,
+            w: &self.w0.row(y)[PAD..PAD + self.len],
+            gradient: &self.gradient[words.clone()],
+            grey: &self.grey[words],
+            stride: self.len,
+        };
+        warp_row(job.level, &source, &mut self.first.warped(y));
+        let valid = self.first.valid.row(y);
+        product_row(job.level, self.l.row(y), valid, self.len, self.l_used.row_mut(y));
+        product_row(job.level, self.ll.row(y), valid, self.len, self.ll_used.row_mut(y));
+    }
+
+    /// Gain and offset, q, and horizontal moments of row `y`.
+    fn normalise(&mut self, job: &Job<'_>, y: isize) {
+        let (level, r, len) = (job.level, job.radius, self.len);
+        let terms = [
+            &self.first.valid,
+            &self.l_used,
+            &self.ll_used,
+            &self.first.g,
+            &self.first.gg,
+        ];
+        for (ring, sum) in terms.into_iter().zip(&mut self.sums) {
+            around(ring, y, r, |rows| {
+                box_sum(level, rows, r, len, &mut self.column, sum.row_mut(y));
+            });
+        }
+        let [n, l, ll, g, gg] = &self.sums;
+        let windowed =
+            Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
+        gain_row(level, &windowed, job.frames, len, self.ratio.row_mut(y), self.offset.row_mut(y));
+        let used = self.s_used.row_mut(y);
+        product_row(level, self.s.row(y), self.first.valid.row(y), len, used);
+        self.residual(job, y, false);
+        let moments = match job.fits {
+            Fits::First => 3,
+            Fits::Both => 5,
+        };
+        let mut out = self.hs.each_mut().map(|h| h.row_mut(y));
+        let s = self.s_used.row(y);
+        horizontal(level, s, r, &self.powers, len, &mut out[..moments]);
+    }
+
+    /// q of row `y` and its horizontal moments, of the first or the second warp.
+    fn residual(&mut self, job: &Job<'_>, y: isize, again: bool) {
+        let (pass, w) = match again {
+            false => (&mut self.first, &self.w0),
+            true => (&mut self.second, &self.w1),
+        };
+        let terms = Terms {
+            s: self.s_used.row(y),
+            il: self.il.row(y),
+            i: self.i.row(y),
+            ig: pass.ig.row(y),
+            ratio: self.ratio.row(y),
+            offset: self.offset.row(y),
+            at: pass.at.row(y),
+            valid: pass.valid.row(y),
+            w: w.row(y),
+            // A coarse start has whole pixels: its slope needs a wider base.
+            base: if again { 2 } else { 4 },
+            step: if again { 1.5 } else { 3.5 },
+            origin: job.origin,
+        };
+        residual_row(job.level, &terms, self.len, pass.q.row_mut(y));
+        let mut out = pass.hq.each_mut().map(|h| h.row_mut(y));
+        horizontal(job.level, pass.q.row(y), job.radius, &self.powers, self.len, &mut out);
+    }
+
+    /// M^-1 and the first fit of row `y`, then the second warp there.
+    fn first_fit(&mut self, job: &Job<'_>, y: isize, x0: usize, inside: bool) {
+        let (level, r, len) = (job.level, job.radius, self.len);
+        let mut inverse = self.inverse.each_mut().map(|h| h.row_mut(y));
+        around_all(&self.hs, y, r, |s| {
+            inverse_rows(level, s, r, &self.powers, len, job.fits, &mut inverse);
+        });
+        self.fits(job, y, x0, inside, false);
+        let w0 = self.w0.row(y);
+        // The start is a whole pixel, perhaps the wrong neighbour: a fit farther off is not this
+        // surface's.
+        let bounds = (job.origin, 2.0);
+        restart_row(level, self.fit[0].row(y), w0, bounds, len, self.w1.row_mut(y));
+        if !inside {
+            self.second.clear(y);
+        } else {
+            let words = self.words_at(y, r);
+            let right = image_rows(job.right, y);
+            let source = Source {
+                right: &right[..job.right.len()],
+                x0,
+                w: &self.w1.row(y)[PAD..PAD + len],
+                gradient: &self.gradient[words.clone()],
+                grey: &self.grey[words],
+                stride: len,
+            };
+            warp_row(level, &source, &mut self.second.warped(y));
+        }
+        self.residual(job, y, true);
+    }
+
+    /// The second fit of row `y`, and its ZNCC.
+    fn second_fit(&mut self, job: &Job<'_>, y: isize, (x0, x1): (usize, usize)) {
+        let (level, r, len) = (job.level, job.radius, self.len);
+        self.fits(job, y, x0, true, true);
+        let terms = [&self.second.g, &self.second.gg, &self.second.lg];
+        for (ring, sum) in terms.into_iter().zip(&mut self.sums_again) {
+            around(ring, y, r, |rows| {
+                box_sum(level, rows, r, len, &mut self.column, sum.row_mut(y));
+            });
+        }
+        let ([n, l, ll, ..], [g, gg, lg]) = (&self.sums, &self.sums_again);
+        let windowed =
+            Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
+        zncc_row(level, &windowed, lg.row(y), job.frames, len, self.zncc.row_mut(y));
+        // Only pixels with a start and a warp of their own are measured.
+        let valid = &self.second.valid.row(y)[PAD..PAD + x1 - x0];
+        for ring in self.fit.iter_mut().chain([&mut self.zncc]) {
+            for (v, &valid) in ring.row_mut(y)[PAD..].iter_mut().zip(valid) {
+                *v = if valid > 0.5 { *v } else { f32::NAN };
+            }
+        }
+    }
+
+    /// Fits of row `y` from the first or second pass, those at steps by the masked window.
+    fn fits(&mut self, job: &Job<'_>, y: isize, x0: usize, inside: bool, again: bool) {
+        let (level, r, len) = (job.level, job.radius, self.len);
+        // The start of the second pass needs no more than the first order.
+        let (pass, w, fits) = match again {
+            false => (&self.first, &self.w0, Fits::First),
+            true => (&self.second, &self.w1, job.fits),
+        };
+        let count = if fits == Fits::First { 1 } else { 2 };
+        let inverse = self.inverse.each_ref().map(|h| h.row(y));
+        let mut out = self.fit.each_mut().map(|h| h.row_mut(y));
+        around_all(&pass.hq, y, r, |q| {
+            disparities(level, q, &inverse, r, &self.powers, len, &mut out[..count]);
+        });
+        if !inside {
+            return;
+        }
+        let step = &job.step.row(y as usize)[x0..];
+        let mut any = false;
+        for (flag, &step) in self.flagged.iter_mut().zip(step) {
+            *flag = f32::from(step);
+            any |= step != 0;
+        }
+        if !any {
+            return;
+        }
+        self.flagged[step.len().min(len)..].fill(0.0);
+        around(&self.s_used, y, r, |s| {
+            around(&pass.q, y, r, |q| {
+                around(w, y, r, |w| {
+                    let window = Window { s, q, w, limit: job.surface_px };
+                    let flagged = &self.flagged;
+                    refit_row(level, &window, flagged, r, &self.powers, len, fits, &mut out);
+                });
+            });
+        });
+    }
+}
+
+/// Row `y` of each image.
+fn image_rows<'a>(images: &[&'a Image<Sample>], y: isize) -> [&'a [Sample]; 16] {
+    std::array::from_fn(|i| images.get(i).map_or(&[][..], |image| image.row(y as usize)))
+}

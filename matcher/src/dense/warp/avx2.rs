@@ -1,0 +1,92 @@
+//! AVX2: 8 pixels a block; each pixel's eight taps are one load, summed by horizontal additions.
+
+use std::arch::x86_64::*;
+
+use super::{Source, Warped, position};
+use crate::dense::kernels::Kernels;
+
+/// Does whole blocks, and returns the number of pixels done.
+///
+/// # Safety
+/// The processor has AVX2; rows hold at least 8 samples; slices are as long as [`super::warp_row`]
+/// checks.
+#[target_feature(enable = "avx2")]
+pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Warped<'_>) -> usize {
+    let width = source.right[0].len();
+    let ones = _mm256_set1_epi16(1);
+    let half = _mm256_set1_epi32(0x8000);
+    let blocks = source.w.len() / 8;
+    for block in 0..blocks {
+        let i = block * 8;
+        let mut first = [0usize; 8];
+        let mut phase = [0usize; 8];
+        let mut mask = [0i32; 8];
+        for l in 0..8 {
+            let place = position(source.x0 + i + l, source.w[i + l], width);
+            out.at[i + l] = place.map_or(0.0, |p| p.0);
+            out.valid[i + l] = if place.is_some() { 1.0 } else { 0.0 };
+            if let Some((_, f, p)) = place {
+                (first[l], phase[l], mask[l]) = (f, p, -1);
+            }
+        }
+        // SAFETY: a phase's taps are 16 bytes; the mask 32.
+        let (taps, mask): ([__m256i; 4], _) = unsafe {
+            let xmm = |p: usize| _mm_loadu_si128(kernels.taps[p].as_ptr().cast());
+            (
+                std::array::from_fn(|j| {
+                    _mm256_inserti128_si256::<1>(
+                        _mm256_castsi128_si256(xmm(phase[j])),
+                        xmm(phase[j + 4]),
+                    )
+                }),
+                _mm256_loadu_si256(mask.as_ptr().cast()),
+            )
+        };
+        let zero = _mm256_setzero_si256();
+        let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
+        for (pair, rows) in source.right.chunks_exact(2).enumerate() {
+            let mut sums = [half; 2];
+            for (sum, row) in sums.iter_mut().zip(rows) {
+                let products: [__m256i; 4] = std::array::from_fn(|j| {
+                    // SAFETY: `first + 8` is at most the row's length.
+                    let samples = unsafe {
+                        let xmm = |f: usize| _mm_loadu_si128(row.as_ptr().add(f).cast());
+                        _mm256_inserti128_si256::<1>(
+                            _mm256_castsi128_si256(xmm(first[j])),
+                            xmm(first[j + 4]),
+                        )
+                    };
+                    _mm256_madd_epi16(samples, taps[j])
+                });
+                let all = _mm256_hadd_epi32(
+                    _mm256_hadd_epi32(products[0], products[1]),
+                    _mm256_hadd_epi32(products[2], products[3]),
+                );
+                *sum = _mm256_add_epi32(*sum, all);
+            }
+            let even = _mm256_srli_epi32::<16>(sums[0]);
+            let g = _mm256_blend_epi16::<0xAA>(even, sums[1]);
+            let word = pair * source.stride + i;
+            // SAFETY: `word + 8` lies within both.
+            let (gradient, grey) = unsafe {
+                (
+                    _mm256_loadu_si256(source.gradient.as_ptr().add(word).cast()),
+                    _mm256_loadu_si256(source.grey.as_ptr().add(word).cast()),
+                )
+            };
+            ig = _mm256_add_epi32(ig, _mm256_madd_epi16(g, gradient));
+            lg = _mm256_add_epi32(lg, _mm256_madd_epi16(g, grey));
+            g1 = _mm256_add_epi32(g1, _mm256_madd_epi16(g, ones));
+            gg = _mm256_add_epi32(gg, _mm256_madd_epi16(g, g));
+        }
+        let float = |v| _mm256_cvtepi32_ps(_mm256_and_si256(v, mask));
+        // SAFETY: `i + 8` lies within every map.
+        unsafe {
+            _mm256_storeu_ps(out.ig.as_mut_ptr().add(i), float(ig));
+            _mm256_storeu_ps(out.g.as_mut_ptr().add(i), float(g1));
+            _mm256_storeu_ps(out.gg.as_mut_ptr().add(i), float(gg));
+            _mm256_storeu_ps(out.lg.as_mut_ptr().add(i), float(lg));
+        }
+    }
+    blocks * 8
+}

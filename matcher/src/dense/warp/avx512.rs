@@ -1,0 +1,108 @@
+//! AVX-512 with VNNI: 16 pixels a block, time in the loop.
+//!
+//! A window of 32 samples holds the taps of all 16 pixels where the disparity varies by at most 8 px
+//! over them; a word permutation picks each pixel's taps in pairs. Blocks that vary more take
+//! further windows for the pixels not yet done.
+
+use std::arch::x86_64::*;
+
+use super::{Source, Warped};
+use crate::dense::kernels::Kernels;
+
+/// Does whole blocks, and returns the number of pixels done.
+///
+/// # Safety
+/// The processor has the features; rows hold at least 32 samples; slices are as long as
+/// [`super::warp_row`] checks.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512vnni")]
+pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Warped<'_>) -> usize {
+    let width = source.right[0].len() as i32;
+    let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    // Per pair of taps, a register of the 16 phases' coefficient pairs.
+    let mut table = [[0i32; 16]; 4];
+    for (phase, taps) in kernels.taps.iter().enumerate() {
+        for (j, t) in table.iter_mut().enumerate() {
+            t[phase] = i32::from(taps[2 * j] as u16) | i32::from(taps[2 * j + 1]) << 16;
+        }
+    }
+    // SAFETY: arrays of 64 bytes.
+    let table = unsafe { table.map(|t| _mm512_loadu_si512(t.as_ptr().cast())) };
+    let ones = _mm512_set1_epi16(1);
+    let half = _mm512_set1_epi32(0x8000);
+    let blocks = source.w.len() / 16;
+    for block in 0..blocks {
+        let i = block * 16;
+        // SAFETY: `i + 16` is at most the number of pixels.
+        let w = unsafe { _mm512_loadu_ps(source.w.as_ptr().add(i)) };
+        let steps = _mm512_cvtps_epi32(_mm512_mul_ps(w, _mm512_set1_ps(16.0)));
+        let x = _mm512_add_epi32(lane, _mm512_set1_epi32((source.x0 + i) as i32));
+        let at = _mm512_sub_epi32(_mm512_slli_epi32::<4>(x), steps);
+        let first = _mm512_sub_epi32(_mm512_srai_epi32::<4>(at), _mm512_set1_epi32(3));
+        let phase = _mm512_and_si512(at, _mm512_set1_epi32(15));
+        // False for NaN.
+        let near = _mm512_set1_ps(super::FARTHEST);
+        let known = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(_mm512_abs_ps(w), near);
+        let right_of = _mm512_cmpge_epi32_mask(first, _mm512_setzero_si512());
+        let left_of = _mm512_cmple_epi32_mask(first, _mm512_set1_epi32(width - 8));
+        let valid = known & right_of & left_of;
+        let taps = table.map(|t| _mm512_permutexvar_epi32(phase, t));
+        let zero = _mm512_setzero_si512();
+        let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
+        let mut left = valid;
+        while left != 0 {
+            let base = _mm512_mask_reduce_min_epi32(left, first).min(width - 32);
+            let offset = _mm512_sub_epi32(first, _mm512_set1_epi32(base));
+            let now = _mm512_mask_cmple_epi32_mask(left, offset, _mm512_set1_epi32(24));
+            left &= !now;
+            // Both halves of a word hold the offset; then pairs of neighbouring samples.
+            let both = _mm512_or_si512(offset, _mm512_slli_epi32::<16>(offset));
+            let pick: [__m512i; 4] = std::array::from_fn(|j| {
+                let j = j as i32;
+                _mm512_add_epi16(both, _mm512_set1_epi32(2 * j | (2 * j + 1) << 16))
+            });
+            let (mut ig_now, mut g1_now, mut gg_now, mut lg_now) = (zero, zero, zero, zero);
+            for (pair, rows) in source.right.chunks_exact(2).enumerate() {
+                let mut sums = [half; 2];
+                for (sum, row) in sums.iter_mut().zip(rows) {
+                    // SAFETY: 0 <= base <= width - 32.
+                    let window =
+                        unsafe { _mm512_loadu_si512(row.as_ptr().add(base as usize).cast()) };
+                    for j in 0..4 {
+                        let samples = _mm512_permutexvar_epi16(pick[j], window);
+                        *sum = _mm512_dpwssd_epi32(*sum, samples, taps[j]);
+                    }
+                }
+                let even = _mm512_srli_epi32::<16>(sums[0]);
+                let g = _mm512_mask_blend_epi16(0xAAAA_AAAA, even, sums[1]);
+                let word = pair * source.stride + i;
+                // SAFETY: `word + 16` lies within both.
+                let (gradient, grey) = unsafe {
+                    (
+                        _mm512_loadu_si512(source.gradient.as_ptr().add(word).cast()),
+                        _mm512_loadu_si512(source.grey.as_ptr().add(word).cast()),
+                    )
+                };
+                ig_now = _mm512_dpwssd_epi32(ig_now, g, gradient);
+                lg_now = _mm512_dpwssd_epi32(lg_now, g, grey);
+                g1_now = _mm512_dpwssd_epi32(g1_now, g, ones);
+                gg_now = _mm512_dpwssd_epi32(gg_now, g, g);
+            }
+            ig = _mm512_mask_mov_epi32(ig, now, ig_now);
+            g1 = _mm512_mask_mov_epi32(g1, now, g1_now);
+            gg = _mm512_mask_mov_epi32(gg, now, gg_now);
+            lg = _mm512_mask_mov_epi32(lg, now, lg_now);
+        }
+        let used = _mm512_mul_ps(_mm512_cvtepi32_ps(steps), _mm512_set1_ps(1.0 / 16.0));
+        // SAFETY: `i + 16` lies within every map.
+        unsafe {
+            _mm512_storeu_ps(out.at.as_mut_ptr().add(i), _mm512_maskz_mov_ps(valid, used));
+            let one = _mm512_maskz_mov_ps(valid, _mm512_set1_ps(1.0));
+            _mm512_storeu_ps(out.valid.as_mut_ptr().add(i), one);
+            _mm512_storeu_ps(out.ig.as_mut_ptr().add(i), _mm512_cvtepi32_ps(ig));
+            _mm512_storeu_ps(out.g.as_mut_ptr().add(i), _mm512_cvtepi32_ps(g1));
+            _mm512_storeu_ps(out.gg.as_mut_ptr().add(i), _mm512_cvtepi32_ps(gg));
+            _mm512_storeu_ps(out.lg.as_mut_ptr().add(i), _mm512_cvtepi32_ps(lg));
+        }
+    }
+    blocks * 16
+}

@@ -1,0 +1,44 @@
+//! Plain Rust.
+
+use std::ops::Range;
+
+use super::{Source, Warped, position};
+use crate::dense::kernels::Kernels;
+
+pub(super) fn pixels(
+    kernels: &Kernels,
+    source: &Source<'_>,
+    range: Range<usize>,
+    out: &mut Warped<'_>,
+) {
+    let width = source.right[0].len();
+    for i in range {
+        let (mut ig, mut g1, mut gg, mut lg) = (0i32, 0i32, 0i32, 0i32);
+        let place = position(source.x0 + i, source.w[i], width);
+        if let Some((_, first, phase)) = place {
+            let taps = &kernels.taps[phase];
+            for (pair, rows) in source.right.chunks_exact(2).enumerate() {
+                let word = pair * source.stride + i;
+                for (half, row) in rows.iter().enumerate() {
+                    let sum: i32 = row[first..first + 8]
+                        .iter()
+                        .zip(taps)
+                        .map(|(&v, &c)| i32::from(v) * i32::from(c))
+                        .fold(0x8000, i32::wrapping_add);
+                    let g = sum >> 16;
+                    let of = |word: i32| if half == 0 { i32::from(word as i16) } else { word >> 16 };
+                    ig = ig.wrapping_add(of(source.gradient[word]) * g);
+                    lg = lg.wrapping_add(of(source.grey[word]) * g);
+                    g1 = g1.wrapping_add(g);
+                    gg = gg.wrapping_add(g * g);
+                }
+            }
+        }
+        out.at[i] = place.map_or(0.0, |p| p.0);
+        out.valid[i] = if place.is_some() { 1.0 } else { 0.0 };
+        out.ig[i] = ig as f32;
+        out.g[i] = g1 as f32;
+        out.gg[i] = gg as f32;
+        out.lg[i] = lg as f32;
+    }
+}
