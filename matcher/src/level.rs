@@ -52,15 +52,9 @@ impl Level {
         Ok(Level::available().filter(|l| l.rank() <= rank).last().unwrap_or(Level::Scalar))
     }
 
-<<<<<<< HEAD
     /// This level, or the best one that this machine runs where it cannot run this one.
     pub fn usable(self) -> Level {
         if self.rank() <= Level::best().rank() && self.runs_here() { self } else { Level::best() }
-=======
-    /// This level where the machine can run it, else [`Level::Scalar`]: kernels rely on it.
-    pub(crate) fn trusted(self) -> Level {
-        Level::available().find(|l| *l == self).unwrap_or(Level::Scalar)
->>>>>>> fe0d355 (Add the dense least-squares fit: kernels, warp, moments, masked refit, and a synthetic scene)
     }
 
     /// Name as [`LEVEL_VARIABLE`] takes it.

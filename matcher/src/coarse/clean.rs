@@ -1,0 +1,196 @@
+//! Cleaning of the coarse map: lone outliers take their neighbours' disparity where they match it as
+//! well, and of several left pixels that claim one right pixel only the best match keeps it.
+
+use rayon::prelude::*;
+
+use super::{
+    CoarseMap, INVALID,
+    descriptor::{Descriptors, MARGIN, vectorised},
+    search::UNSURE_COST,
+};
+use crate::{Image, Level};
+
+/// An outlier that matches better than its neighbours' disparity by more bits stays: a thin object.
+const THIN_BITS: u32 = 5;
+/// Left pixels this near may share a right pixel: a surface seen at a slant.
+const SHARED_PX: usize = 2;
+
+/// Replaces outliers of `map` by the median of their 3x3 neighbours, into `out`.
+pub(crate) fn replace_outliers(
+    level: Level,
+    left: &Descriptors,
+    right: &Descriptors,
+    map: &CoarseMap,
+    out: &mut CoarseMap,
+) {
+    let (width, height) = (map.disparity.width(), map.disparity.height());
+    out.disparity
+        .as_mut_slice()
+        .par_chunks_mut(width * 16)
+        .zip(out.cost.as_mut_slice().par_chunks_mut(width * 16))
+        .enumerate()
+        .for_each_init(
+            || vec![0i16; width],
+            |median, (band, (disparity, cost))| {
+                let rows = disparity.chunks_mut(width).zip(cost.chunks_mut(width));
+                for (i, (disparity, cost)) in rows.enumerate() {
+                    let y = band * 16 + i;
+                    disparity.copy_from_slice(map.disparity.row(y));
+                    cost.copy_from_slice(map.cost.row(y));
+                    medians(level, &map.disparity, y, height, median);
+                    for x in 0..width {
+                        if median[x].abs_diff(disparity[x]) > 1
+                            || u32::from(cost[x]) > UNSURE_COST
+                        {
+                            let bits = |d: i32| distance(left, right, x, y, d);
+                            settle(median[x], bits, &mut disparity[x], &mut cost[x]);
+                        }
+                    }
+                }
+            },
+        );
+}
+
+/// Decides between a pixel's own disparity and its neighbours' `median`.
+fn settle(median: i16, bits: impl Fn(i32) -> Option<u32>, disparity: &mut i16, cost: &mut u8) {
+    let around = (median != INVALID)
+        .then(|| {
+            (-1..=1)
+                .filter_map(|o| Some((bits(i32::from(median) + o)?, i32::from(median) + o)))
+                .min()
+        })
+        .flatten();
+    let own = if *disparity == INVALID { u32::MAX } else { u32::from(*cost) };
+    match around {
+        Some((bits, d)) if bits <= own.saturating_add(THIN_BITS) => {
+            *disparity = d as i16;
+            *cost = bits as u8;
+        }
+        _ => {}
+    }
+    // Nothing that differs in so many bits is a match; neighbours cannot make it one.
+    if u32::from(*cost) > UNSURE_COST + THIN_BITS {
+        *disparity = INVALID;
+        *cost = u8::MAX;
+    }
+}
+
+fn distance(left: &Descriptors, right: &Descriptors, x: usize, y: usize, d: i32) -> Option<u32> {
+    let at = x as i64 - i64::from(d);
+    (0..left.width() as i64).contains(&at).then(|| {
+        (left.row(y)[MARGIN + x] ^ right.row(y)[MARGIN + at as usize]).count_ones()
+    })
+}
+
+fn medians(level: Level, map: &Image<i16>, y: usize, height: usize, out: &mut [i16]) {
+    let (above, below) = (map.row(y.saturating_sub(1)), map.row((y + 1).min(height - 1)));
+    let width = out.len();
+    let row = map.row(y);
+    for x in [0, width - 1] {
+        let (a, b) = (x.saturating_sub(1), (x + 1).min(width - 1));
+        out[x] = median([
+            above[a], above[x], above[b], row[a], row[x], row[b], below[a], below[x], below[b],
+        ]);
+    }
+    if width < 3 {
+        return;
+    }
+    vectorised!(
+        level,
+        medians_loop(
+            above: &[i16] = above,
+            row: &[i16] = row,
+            below: &[i16] = below,
+            out: &mut [i16] = &mut out[1..width - 1],
+        )
+    );
+}
+
+#[inline(always)]
+fn medians_loop(above: &[i16], row: &[i16], below: &[i16], out: &mut [i16]) {
+    let n = out.len();
+    let (a0, a1, a2) = (&above[..n], &above[1..n + 1], &above[2..n + 2]);
+    let (b0, b1, b2) = (&row[..n], &row[1..n + 1], &row[2..n + 2]);
+    let (c0, c1, c2) = (&below[..n], &below[1..n + 1], &below[2..n + 2]);
+    for i in 0..n {
+        out[i] = median([a0[i], a1[i], a2[i], b0[i], b1[i], b2[i], c0[i], c1[i], c2[i]]);
+    }
+}
+
+/// Median of nine: columns sorted, then the median of the largest low, middle middle and smallest
+/// high.
+#[inline(always)]
+fn median(v: [i16; 9]) -> i16 {
+    let sort = |a: i16, b: i16, c: i16| {
+        let (lo, hi) = (a.min(b), a.max(b));
+        (lo.min(c), lo.max(hi.min(c)), hi.max(c))
+    };
+    let middle = |a: i16, b: i16, c: i16| a.min(b).max(a.max(b).min(c));
+    let (l0, m0, h0) = sort(v[0], v[3], v[6]);
+    let (l1, m1, h1) = sort(v[1], v[4], v[7]);
+    let (l2, m2, h2) = sort(v[2], v[5], v[8]);
+    middle(l0.max(l1).max(l2), middle(m0, m1, m2), h0.min(h1).min(h2))
+}
+
+/// The left-right check: a right pixel belongs to the left pixel that matches it best; others that
+/// claim it from farther away are occluded or wrong, and become invalid.
+pub(crate) fn left_right(map: &mut CoarseMap) {
+    let width = map.disparity.width();
+    map.disparity
+        .as_mut_slice()
+        .par_chunks_mut(width * 16)
+        .zip(map.cost.as_slice().par_chunks(width * 16))
+        .for_each_init(
+            || vec![u32::MAX; width],
+            |claims, (disparity, cost)| {
+                for (disparity, cost) in disparity.chunks_mut(width).zip(cost.chunks(width)) {
+                    claims.fill(u32::MAX);
+                    let counterpart = |x: usize, d: i16| (x as i32 - i32::from(d)) as usize;
+                    for (x, (&d, &c)) in disparity.iter().zip(cost).enumerate() {
+                        if d != INVALID {
+                            let claim = &mut claims[counterpart(x, d)];
+                            *claim = (*claim).min(u32::from(c) << 16 | x as u32);
+                        }
+                    }
+                    for (x, d) in disparity.iter_mut().enumerate() {
+                        if *d != INVALID {
+                            let owner = (claims[counterpart(x, *d)] & 0xFFFF) as usize;
+                            if owner.abs_diff(x) > SHARED_PX {
+                                *d = INVALID;
+                            }
+                        }
+                    }
+                }
+            },
+        );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::synthetic::Random;
+
+    #[test]
+    fn median_is_the_fifth_of_nine() {
+        let mut random = Random::new(4);
+        for _ in 0..2000 {
+            let v: [i16; 9] = std::array::from_fn(|_| (random.bits() % 12) as i16);
+            let mut sorted = v;
+            sorted.sort_unstable();
+            assert_eq!(median(v), sorted[4]);
+        }
+    }
+
+    #[test]
+    fn a_right_pixel_keeps_one_owner() {
+        let mut map = CoarseMap::new(12, 1);
+        // Pixels 4 and 9 claim right pixel 3; 9 matches better.
+        map.disparity.set(4, 0, 1);
+        map.cost.set(4, 0, 9);
+        map.disparity.set(9, 0, 6);
+        map.cost.set(9, 0, 2);
+        left_right(&mut map);
+        assert_eq!(map.disparity.get(4, 0), Some(INVALID));
+        assert_eq!(map.disparity.get(9, 0), Some(6));
+    }
+}
