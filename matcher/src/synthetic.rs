@@ -125,29 +125,32 @@ impl Scene {
                 })
                 .max_by(|a, b| a.1.total_cmp(&b.1))
         };
+        // For each pixel of both images: which layer is seen and at which left x.
+        let see = |frame: usize| {
+            let mut seen = [vec![None; w * h], vec![None; w * h]];
+            let [left, right] = &mut seen;
+            left.par_chunks_mut(w).zip(right.par_chunks_mut(w)).enumerate().for_each(
+                |(y, (left, right))| {
+                    for x in 0..w {
+                        let (x_px, y_px) = (x as f64, y as f64);
+                        left[x] = truth_at(x_px, y_px, frame).map(|(l, _)| (l, x_px));
+                        right[x] = self.seen_by_right(x_px, y_px, frame);
+                    }
+                },
+            );
+            seen
+        };
+        let moving = self.layers.iter().any(|l| l.rate_px_per_frame != 0.0);
+        let still = if moving { None } else { Some(see(self.frames - 1)) };
+        let dark = self.ambient_dn * self.right_gain + self.right_offset_dn;
         let frames: Vec<(Image<Sample>, Image<Sample>)> = (0..self.frames)
             .into_par_iter()
             .map(|frame| {
-                // For each pixel of both images: which layer is seen and at which left x.
-                let mut seen_left = vec![None; w * h];
-                let mut seen_right = vec![None; w * h];
-                for y in 0..h {
-                    for x in 0..w {
-                        let at = y * w + x;
-                        seen_left[at] =
-                            truth_at(x as f64, y as f64, frame).map(|(l, _)| (l, x as f64));
-                        seen_right[at] = self.seen_by_right(x as f64, y as f64, frame);
-                    }
-                }
+                let own = if moving { Some(see(frame)) } else { None };
+                let [left, right] = own.as_ref().or(still.as_ref()).expect("one of them is set");
                 (
-                    self.splat(frame, &seen_left, 1.0, self.ambient_dn, 0),
-                    self.splat(
-                        frame,
-                        &seen_right,
-                        self.right_gain,
-                        self.ambient_dn * self.right_gain + self.right_offset_dn,
-                        1,
-                    ),
+                    self.splat(frame, left, 1.0, self.ambient_dn, 0),
+                    self.splat(frame, right, self.right_gain, dark, 1),
                 )
             })
             .collect();
@@ -212,7 +215,7 @@ impl Scene {
             let margin = 700.0;
             let area = (w as f64 + 2.0 * margin) * h as f64;
             let dots = (area * self.dots_per_px) as usize;
-            let mut by_row: Vec<Vec<(f64, f64, f64)>> = vec![Vec::new(); h];
+            let mut by_row: Vec<Vec<(f64, f64)>> = vec![Vec::new(); h];
             for _ in 0..dots {
                 let cx = random.unit() * (w as f64 + 2.0 * margin) - margin;
                 let cy = random.unit() * h as f64;
@@ -220,7 +223,7 @@ impl Scene {
                 let (y0, y1) = ((cy - reach).ceil().max(0.0), (cy + reach).floor());
                 for y in y0 as usize..=(y1.min(h as f64 - 1.0)) as usize {
                     let dy = y as f64 - cy;
-                    by_row[y].push((cx, peak * (k * dy * dy).exp(), 0.0));
+                    by_row[y].push((cx, peak * (k * dy * dy).exp()));
                 }
             }
             for (y, dots) in by_row.iter_mut().enumerate() {

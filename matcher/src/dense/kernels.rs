@@ -20,7 +20,7 @@ const DESIGN_SIGMA_PX: f64 = 0.75;
 /// Dot sizes at which the interpolation's shift bias is kept small.
 const UNBIASED_SIGMA_PX: [f64; 5] = [0.75, 0.85, 1.0, 1.2, 1.4];
 /// Weight of the squared bias against the integrated squared error.
-const BIAS_WEIGHT: f64 = 1e6;
+const BIAS_WEIGHT: f64 = 1e4;
 /// Weight of frequencies that no dot has, so that noise is not amplified.
 const FLOOR: f64 = 1e-4;
 /// Nodes of the integral over frequency.

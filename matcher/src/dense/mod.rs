@@ -20,6 +20,8 @@ pub(crate) mod refit;
 pub(crate) mod solve;
 pub(crate) mod tile;
 pub(crate) mod warp;
+#[cfg(test)]
+mod timing;
 
 use std::sync::Mutex;
 

@@ -165,15 +165,18 @@ fn horizontal_lanes<V: Lanes, const K: usize>(
 /// Vertical moments at pixel `i` of horizontal moments `k`: `m[l]` = sum over j of
 /// (j / radius)^l rows[radius + j][i].
 ///
+/// `R` is the radius known to the compiler, or 0.
+///
 /// # Safety
 /// `i + COUNT` lies within every row, and there are 2 `radius` + 1 rows.
 #[inline(always)]
-pub(crate) unsafe fn vertical<V: Lanes, const L: usize>(
+pub(crate) unsafe fn vertical<V: Lanes, const L: usize, const R: usize>(
     rows: &[&[f32]],
     radius: usize,
     powers: &Powers,
     i: usize,
 ) -> [V; L] {
+    let radius = if R == 0 { radius } else { R };
     // SAFETY: the caller's promise.
     let load = |row: usize| unsafe { V::load(rows.get_unchecked(row).as_ptr().add(i)) };
     let mut m = [V::splat(0.0); L];

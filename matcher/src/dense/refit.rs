@@ -108,7 +108,7 @@ fn refit_both<V: Lanes>(
         // SAFETY: checked by `refit_row`.
         let (s, q) = unsafe { sums::<V, 5, 3>(window, radius, powers, PAD + at) };
         let first = first_fit(&s, &q);
-        let a = inverse_row(second_matrix(|a, b| s[a][b]));
+        let a = inverse_row(second_matrix(&s));
         let slopes = a[0].mul_add(q[1][0], a[1].mul_add(q[0][1], a[5].mul(q[0][0])));
         let curves = a[3].mul_add(q[1][1], a[4].mul(q[0][2]));
         let second = a[2].mul_add(q[2][0], slopes.add(curves));
@@ -122,7 +122,7 @@ fn refit_both<V: Lanes>(
 
 #[inline(always)]
 fn first_fit<V: Lanes, const K: usize, const L: usize>(s: &[[V; K]; K], q: &[[V; L]; L]) -> V {
-    let a = inverse_row(first_matrix(|a, b| s[a][b]));
+    let a = inverse_row(first_matrix(s));
     a[0].mul_add(q[1][0], a[1].mul_add(q[0][1], a[2].mul(q[0][0])))
 }
 

@@ -17,60 +17,100 @@ pub(crate) const SECOND: usize = 6;
 /// A pivot below this part of its diagonal makes the window singular.
 const SINGULAR: f32 = 1e-4;
 
-/// First row of the inverse of a symmetric positive `m`, whose *last* variable is the constant: the
-/// solution of m a = e_last by L D L^T, in which the forward substitution falls away. NaN where
-/// singular.
+/// Repeats a block with a constant in place of a loop variable, so that the matrices below live in
+/// registers.
+macro_rules! each {
+    ($name:ident in $($value:literal)* => $body:block) => {
+        $({ #[allow(unused)] const $name: usize = $value; $body })*
+    };
+}
+
+/// First row of the inverse of a symmetric positive `m` (its lower part is read), whose *last*
+/// variable is the constant: the solution of m a = e_last by L D L^T, in which the forward
+/// substitution falls away. NaN where singular.
 #[inline(always)]
 pub(crate) fn inverse_row<V: Lanes, const N: usize>(mut m: [[V; N]; N]) -> [V; N] {
-    let zero = V::splat(0.0);
-    let mut good = V::splat(-1.0).lt(zero);
-    let mut a = [zero; N];
-    for k in 0..N {
-        // At this point m[k][k] is the pivot; the strict lower part keeps the columns of L.
-        let diagonal = m[k][k];
-        let mut pivot = diagonal;
-        for j in 0..k {
-            // m[j][k] holds L[k][j] D[j].
-            pivot = m[k][j].neg_mul_add(m[j][k], pivot);
-        }
-        good = V::both(good, diagonal.mul(V::splat(SINGULAR)).lt(pivot));
-        let reciprocal = V::splat(1.0).div(pivot);
-        for i in k + 1..N {
-            let mut v = m[i][k];
-            for j in 0..k {
-                v = m[i][j].neg_mul_add(m[j][k], v);
+    const { assert!(N <= 6) };
+    let one = V::splat(1.0);
+    let mut good = V::splat(0.0).lt(one);
+    let mut diagonal = [one; N];
+    for (i, d) in diagonal.iter_mut().enumerate() {
+        *d = m[i][i].mul(V::splat(SINGULAR));
+    }
+    each!(K in 0 1 2 3 4 5 => {
+        if K < N {
+            good = V::both(good, diagonal[K].lt(m[K][K]));
+            let reciprocal = m[K][K].reciprocal();
+            each!(I in 1 2 3 4 5 => {
+                if I > K && I < N {
+                    let factor = m[I][K].mul(reciprocal);
+                    each!(J in 1 2 3 4 5 => {
+                        if J > K && J <= I {
+                            m[I][J] = factor.neg_mul_add(m[J][K], m[I][J]);
+                        }
+                    });
+                    // The upper part keeps L.
+                    m[K][I] = factor;
+                }
+            });
+            if K + 1 == N {
+                m[K][K] = reciprocal;
             }
-            m[k][i] = v;
-            m[i][k] = v.mul(reciprocal);
         }
-        if k + 1 == N {
-            a[k] = reciprocal;
+    });
+    let mut a = [V::splat(0.0); N];
+    a[N - 1] = m[N - 1][N - 1];
+    each!(R in 1 2 3 4 5 => {
+        if R < N {
+            let i = N - 1 - R;
+            each!(K in 1 2 3 4 5 => {
+                if K > i && K < N {
+                    a[i] = m[i][K].neg_mul_add(a[K], a[i]);
+                }
+            });
         }
+    });
+    for v in &mut a {
+        *v = V::select(good, *v, V::splat(f32::NAN));
     }
-    for i in (0..N - 1).rev() {
-        let mut v = zero;
-        for k in i + 1..N {
-            v = m[k][i].neg_mul_add(a[k], v);
-        }
-        a[i] = v;
-    }
-    let nan = V::splat(f32::NAN);
-    a.map(|v| V::select(good, v, nan))
+    a
 }
 
-/// `S` moments as the second-order matrix over x, y, x^2, xy, y^2, 1: `m[a][b]` is the moment of
-/// x^a y^b.
+/// Powers of x and y of each variable, the constant last.
+const PHI_SECOND: [(usize, usize); SECOND] = [(1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (0, 0)];
+const PHI_FIRST: [(usize, usize); FIRST] = [(1, 0), (0, 1), (0, 0)];
+
+/// Lower part of the second-order matrix over x, y, x^2, xy, y^2, 1, from moments of S: `m[a][b]` is
+/// that of x^a y^b.
 #[inline(always)]
-pub(crate) fn second_matrix<V: Lanes>(m: impl Fn(usize, usize) -> V) -> [[V; SECOND]; SECOND] {
-    const PHI: [(usize, usize); SECOND] = [(1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (0, 0)];
-    std::array::from_fn(|i| std::array::from_fn(|j| m(PHI[i].0 + PHI[j].0, PHI[i].1 + PHI[j].1)))
+pub(crate) fn second_matrix<V: Lanes>(m: &[[V; 5]; 5]) -> [[V; SECOND]; SECOND] {
+    let mut matrix = [[V::splat(0.0); SECOND]; SECOND];
+    each!(I in 0 1 2 3 4 5 => {
+        each!(J in 0 1 2 3 4 5 => {
+            if J <= I {
+                const A: usize = PHI_SECOND[I].0 + PHI_SECOND[J].0;
+                const B: usize = PHI_SECOND[I].1 + PHI_SECOND[J].1;
+                matrix[I][J] = m[A][B];
+            }
+        });
+    });
+    matrix
 }
 
-/// `S` moments as the first-order matrix over x, y, 1.
+/// Lower part of the first-order matrix over x, y, 1.
 #[inline(always)]
-pub(crate) fn first_matrix<V: Lanes>(m: impl Fn(usize, usize) -> V) -> [[V; FIRST]; FIRST] {
-    const PHI: [(usize, usize); FIRST] = [(1, 0), (0, 1), (0, 0)];
-    std::array::from_fn(|i| std::array::from_fn(|j| m(PHI[i].0 + PHI[j].0, PHI[i].1 + PHI[j].1)))
+pub(crate) fn first_matrix<V: Lanes, const K: usize>(m: &[[V; K]; K]) -> [[V; FIRST]; FIRST] {
+    let mut matrix = [[V::splat(0.0); FIRST]; FIRST];
+    each!(I in 0 1 2 => {
+        each!(J in 0 1 2 => {
+            if J <= I {
+                const A: usize = PHI_FIRST[I].0 + PHI_FIRST[J].0;
+                const B: usize = PHI_FIRST[I].1 + PHI_FIRST[J].1;
+                matrix[I][J] = m[A][B];
+            }
+        });
+    });
+    matrix
 }
 
 /// Which fits a solve gives.
@@ -106,7 +146,7 @@ pub(crate) fn inverse_rows(
     match fits {
         Fits::First => dispatch!(
             level,
-            inverse_first(
+            inverse_first_any(
                 s: MomentRows<'_, 5> = s,
                 radius: usize = radius,
                 powers: &Powers = powers,
@@ -116,7 +156,7 @@ pub(crate) fn inverse_rows(
         ),
         Fits::Both => dispatch!(
             level,
-            inverse_both(
+            inverse_both_any(
                 s: MomentRows<'_, 5> = s,
                 radius: usize = radius,
                 powers: &Powers = powers,
@@ -128,7 +168,7 @@ pub(crate) fn inverse_rows(
 }
 
 #[inline(always)]
-fn inverse_first<V: Lanes>(
+fn inverse_first<V: Lanes, const R: usize>(
     s: MomentRows<'_, 5>,
     radius: usize,
     powers: &Powers,
@@ -139,16 +179,13 @@ fn inverse_first<V: Lanes>(
         // SAFETY: checked by `inverse_rows`.
         let (m0, m1, m2) = unsafe {
             (
-                vertical::<V, 3>(s[0], radius, powers, i),
-                vertical::<V, 2>(s[1], radius, powers, i),
-                vertical::<V, 1>(s[2], radius, powers, i),
+                vertical::<V, 3, R>(s[0], radius, powers, i),
+                vertical::<V, 2, R>(s[1], radius, powers, i),
+                vertical::<V, 1, R>(s[2], radius, powers, i),
             )
         };
-        let first = inverse_row(first_matrix(|a, b| match a {
-            0 => m0[b],
-            1 => m1[b],
-            _ => m2[b],
-        }));
+        let zero = V::splat(0.0);
+        let first = inverse_row(first_matrix(&[m0, [m1[0], m1[1], zero], [m2[0], zero, zero]]));
         for (row, v) in rows.iter_mut().zip(first) {
             // SAFETY: as above.
             unsafe { v.store(row.as_mut_ptr().add(i)) };
@@ -157,7 +194,7 @@ fn inverse_first<V: Lanes>(
 }
 
 #[inline(always)]
-fn inverse_both<V: Lanes>(
+fn inverse_both<V: Lanes, const R: usize>(
     s: MomentRows<'_, 5>,
     radius: usize,
     powers: &Powers,
@@ -168,23 +205,29 @@ fn inverse_both<V: Lanes>(
         // SAFETY: checked by `inverse_rows`.
         let (m0, m1, m2, m3, m4) = unsafe {
             (
-                vertical::<V, 5>(s[0], radius, powers, i),
-                vertical::<V, 4>(s[1], radius, powers, i),
-                vertical::<V, 3>(s[2], radius, powers, i),
-                vertical::<V, 2>(s[3], radius, powers, i),
-                vertical::<V, 1>(s[4], radius, powers, i),
+                vertical::<V, 5, R>(s[0], radius, powers, i),
+                vertical::<V, 4, R>(s[1], radius, powers, i),
+                vertical::<V, 3, R>(s[2], radius, powers, i),
+                vertical::<V, 2, R>(s[3], radius, powers, i),
+                vertical::<V, 1, R>(s[4], radius, powers, i),
             )
         };
-        let moment = |a: usize, b: usize| match a {
-            0 => m0[b],
-            1 => m1[b],
-            2 => m2[b],
-            3 => m3[b],
-            _ => m4[b],
-        };
-        let first = inverse_row(first_matrix(moment));
-        let second = inverse_row(second_matrix(moment));
-        for (row, v) in rows.iter_mut().zip(first.into_iter().chain(second)) {
+        let z = V::splat(0.0);
+        let moments = [
+            m0,
+            [m1[0], m1[1], m1[2], m1[3], z],
+            [m2[0], m2[1], m2[2], z, z],
+            [m3[0], m3[1], z, z, z],
+            [m4[0], z, z, z, z],
+        ];
+        let first = inverse_row(first_matrix(&moments));
+        let second = inverse_row(second_matrix(&moments));
+        let (to_first, to_second) = rows.split_at_mut(FIRST);
+        for (row, v) in to_first.iter_mut().zip(first) {
+            // SAFETY: as above.
+            unsafe { v.store(row.as_mut_ptr().add(i)) };
+        }
+        for (row, v) in to_second.iter_mut().zip(second) {
             // SAFETY: as above.
             unsafe { v.store(row.as_mut_ptr().add(i)) };
         }
@@ -211,7 +254,7 @@ pub(crate) fn disparities(
     assert!(inverse.iter().all(|r| r.len() >= padded) && out.iter().all(|r| r.len() >= padded));
     dispatch!(
         level,
-        disparities_lanes(
+        disparities_any(
             q: MomentRows<'_, 3> = q,
             inverse: &[&[f32]] = inverse,
             radius: usize = radius,
@@ -223,7 +266,7 @@ pub(crate) fn disparities(
 }
 
 #[inline(always)]
-fn disparities_lanes<V: Lanes>(
+fn disparities_lanes<V: Lanes, const R: usize>(
     q: MomentRows<'_, 3>,
     inverse: &[&[f32]],
     radius: usize,
@@ -238,9 +281,9 @@ fn disparities_lanes<V: Lanes>(
         // SAFETY: as above.
         let (q0, q1, q2) = unsafe {
             (
-                vertical::<V, 3>(q[0], radius, powers, i),
-                vertical::<V, 2>(q[1], radius, powers, i),
-                vertical::<V, 1>(q[2], radius, powers, i),
+                vertical::<V, 3, R>(q[0], radius, powers, i),
+                vertical::<V, 2, R>(q[1], radius, powers, i),
+                vertical::<V, 1, R>(q[2], radius, powers, i),
             )
         };
         let first = row(0).mul_add(q1[0], row(1).mul_add(q0[1], row(2).mul(q0[0])));
@@ -253,5 +296,49 @@ fn disparities_lanes<V: Lanes>(
             // SAFETY: as above.
             unsafe { second.store(out[1].as_mut_ptr().add(i)) };
         }
+    }
+}
+
+/// The paper's radius is compiled for itself, all others together.
+#[inline(always)]
+fn inverse_first_any<V: Lanes>(
+    s: MomentRows<'_, 5>,
+    radius: usize,
+    powers: &Powers,
+    len: usize,
+    rows: &mut [&mut [f32]],
+) {
+    match radius {
+        4 => inverse_first::<V, 4>(s, radius, powers, len, rows),
+        _ => inverse_first::<V, 0>(s, radius, powers, len, rows),
+    }
+}
+
+#[inline(always)]
+fn inverse_both_any<V: Lanes>(
+    s: MomentRows<'_, 5>,
+    radius: usize,
+    powers: &Powers,
+    len: usize,
+    rows: &mut [&mut [f32]],
+) {
+    match radius {
+        4 => inverse_both::<V, 4>(s, radius, powers, len, rows),
+        _ => inverse_both::<V, 0>(s, radius, powers, len, rows),
+    }
+}
+
+#[inline(always)]
+fn disparities_any<V: Lanes>(
+    q: MomentRows<'_, 3>,
+    inverse: &[&[f32]],
+    radius: usize,
+    powers: &Powers,
+    len: usize,
+    out: &mut [&mut [f32]],
+) {
+    match radius {
+        4 => disparities_lanes::<V, 4>(q, inverse, radius, powers, len, out),
+        _ => disparities_lanes::<V, 0>(q, inverse, radius, powers, len, out),
     }
 }

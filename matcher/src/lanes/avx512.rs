@@ -50,6 +50,14 @@ impl Lanes for F32x16 {
         Self(unsafe { _mm512_div_ps(self.0, other.0) })
     }
     #[inline(always)]
+    fn reciprocal(self) -> Self {
+        // SAFETY: see the impl.
+        // One Newton step on the processor's estimate.
+        let estimate = Self(unsafe { _mm512_rcp14_ps(self.0) });
+        let error = self.neg_mul_add(estimate, Self::splat(1.0));
+        estimate.mul_add(error, estimate)
+    }
+    #[inline(always)]
     fn mul_add(self, factor: Self, addend: Self) -> Self {
         // SAFETY: see the impl.
         Self(unsafe { _mm512_fmadd_ps(self.0, factor.0, addend.0) })

@@ -44,6 +44,8 @@ pub(crate) trait Lanes: Copy {
     fn mul(self, other: Self) -> Self;
     /// Quotient.
     fn div(self, other: Self) -> Self;
+    /// 1 / self, to within two units in the last place.
+    fn reciprocal(self) -> Self;
     /// self * factor + addend, fused where the level can.
     fn mul_add(self, factor: Self, addend: Self) -> Self;
     /// addend - self * factor, fused where the level can.

@@ -50,6 +50,10 @@ impl Lanes for F32x4 {
         Self(unsafe { vdivq_f32(self.0, other.0) })
     }
     #[inline(always)]
+    fn reciprocal(self) -> Self {
+        Self::splat(1.0).div(self)
+    }
+    #[inline(always)]
     fn mul_add(self, factor: Self, addend: Self) -> Self {
         // SAFETY: see the impl.
         Self(unsafe { vfmaq_f32(addend.0, self.0, factor.0) })

@@ -41,6 +41,10 @@ impl Lanes for Plain {
         Self(self.0 / other.0)
     }
     #[inline(always)]
+    fn reciprocal(self) -> Self {
+        Self(1.0 / self.0)
+    }
+    #[inline(always)]
     fn mul_add(self, factor: Self, addend: Self) -> Self {
         Self(self.0 * factor.0 + addend.0)
     }

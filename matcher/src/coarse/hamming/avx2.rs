@@ -22,10 +22,11 @@ pub(super) unsafe fn search(
     for block in 0..left.len() / BLOCK {
         for half in 0..2 {
             let at = block * BLOCK + half * 16;
-            // SAFETY: `at + 16` lies within `left`.
-            let l: [__m256i; 4] = std::array::from_fn(|k| unsafe {
-                _mm256_loadu_si256(left.as_ptr().add(at + 4 * k).cast())
-            });
+            let mut l = [zero; 4];
+            for (k, l) in l.iter_mut().enumerate() {
+                // SAFETY: `at + 16` lies within `left`.
+                *l = unsafe { _mm256_loadu_si256(left.as_ptr().add(at + 4 * k).cast()) };
+            }
             let mut b = [_mm256_set1_epi64x(i64::from(u32::MAX)); 4];
             let from = origin + at;
             for (c, &shift) in shifts.iter().enumerate() {

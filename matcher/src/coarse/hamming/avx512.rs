@@ -16,10 +16,11 @@ pub(super) unsafe fn search(
 ) {
     for block in 0..left.len() / BLOCK {
         let at = block * BLOCK;
-        // SAFETY: `at + 32` lies within `left`.
-        let l: [__m512i; 4] = std::array::from_fn(|k| unsafe {
-            _mm512_loadu_si512(left.as_ptr().add(at + 8 * k).cast())
-        });
+        let mut l = [_mm512_setzero_si512(); 4];
+        for (k, l) in l.iter_mut().enumerate() {
+            // SAFETY: `at + 32` lies within `left`.
+            *l = unsafe { _mm512_loadu_si512(left.as_ptr().add(at + 8 * k).cast()) };
+        }
         let mut b = [_mm512_set1_epi64(i64::from(u32::MAX)); 4];
         let from = origin + at;
         for (c, &shift) in shifts.iter().enumerate() {

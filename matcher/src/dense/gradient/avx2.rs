@@ -17,7 +17,11 @@ pub(super) unsafe fn blocks(
     blocks: usize,
     out: &mut Static<'_>,
 ) {
-    let c = kernels.gradient.map(|c| _mm256_set1_epi16(c));
+    let c = [
+        _mm256_set1_epi16(kernels.gradient[0]),
+        _mm256_set1_epi16(kernels.gradient[1]),
+        _mm256_set1_epi16(kernels.gradient[2]),
+    ];
     let quarter = _mm256_set1_epi16(8192);
     let ones = _mm256_set1_epi16(1);
     for block in 0..blocks {

@@ -24,8 +24,17 @@ pub(super) unsafe fn blocks(
         }
     }
     // SAFETY: arrays of 64 bytes.
-    let order = unsafe { order.map(|o| _mm512_loadu_si512(o.as_ptr().cast())) };
-    let c = kernels.gradient.map(|c| _mm512_set1_epi16(c));
+    let order = unsafe {
+        [
+            _mm512_loadu_si512(order[0].as_ptr().cast()),
+            _mm512_loadu_si512(order[1].as_ptr().cast()),
+        ]
+    };
+    let c = [
+        _mm512_set1_epi16(kernels.gradient[0]),
+        _mm512_set1_epi16(kernels.gradient[1]),
+        _mm512_set1_epi16(kernels.gradient[2]),
+    ];
     let quarter = _mm512_set1_epi16(8192);
     let ones = _mm512_set1_epi16(1);
     for block in 0..blocks {

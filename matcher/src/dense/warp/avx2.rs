@@ -29,35 +29,25 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
                 (first[l], phase[l], mask[l]) = (f, p, -1);
             }
         }
-        // SAFETY: a phase's taps are 16 bytes; the mask 32.
-        let (taps, mask): ([__m256i; 4], _) = unsafe {
-            let xmm = |p: usize| _mm_loadu_si128(kernels.taps[p].as_ptr().cast());
-            (
-                std::array::from_fn(|j| {
-                    _mm256_inserti128_si256::<1>(
-                        _mm256_castsi128_si256(xmm(phase[j])),
-                        xmm(phase[j + 4]),
-                    )
-                }),
-                _mm256_loadu_si256(mask.as_ptr().cast()),
-            )
-        };
+        let mut taps = [half; 4];
+        for (j, taps) in taps.iter_mut().enumerate() {
+            // SAFETY: a phase's taps are 16 bytes.
+            *taps = unsafe { two(kernels.taps[phase[j]].as_ptr(), kernels.taps[phase[j + 4]].as_ptr()) };
+        }
+        // SAFETY: 32 bytes.
+        let mask = unsafe { _mm256_loadu_si256(mask.as_ptr().cast()) };
         let zero = _mm256_setzero_si256();
         let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
         for (pair, rows) in source.right.chunks_exact(2).enumerate() {
             let mut sums = [half; 2];
             for (sum, row) in sums.iter_mut().zip(rows) {
-                let products: [__m256i; 4] = std::array::from_fn(|j| {
+                let mut products = taps;
+                for (j, product) in products.iter_mut().enumerate() {
                     // SAFETY: `first + 8` is at most the row's length.
-                    let samples = unsafe {
-                        let xmm = |f: usize| _mm_loadu_si128(row.as_ptr().add(f).cast());
-                        _mm256_inserti128_si256::<1>(
-                            _mm256_castsi128_si256(xmm(first[j])),
-                            xmm(first[j + 4]),
-                        )
-                    };
-                    _mm256_madd_epi16(samples, taps[j])
-                });
+                    let samples =
+                        unsafe { two(row.as_ptr().add(first[j]), row.as_ptr().add(first[j + 4])) };
+                    *product = _mm256_madd_epi16(samples, *product);
+                }
                 let all = _mm256_hadd_epi32(
                     _mm256_hadd_epi32(products[0], products[1]),
                     _mm256_hadd_epi32(products[2], products[3]),
@@ -89,4 +79,20 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
         }
     }
     blocks * 8
+}
+
+/// Eight samples from each of two places.
+///
+/// # Safety
+/// They are readable.
+#[target_feature(enable = "avx2")]
+#[inline]
+unsafe fn two(low: *const i16, high: *const i16) -> __m256i {
+    // SAFETY: the caller's promise.
+    unsafe {
+        _mm256_inserti128_si256::<1>(
+            _mm256_castsi128_si256(_mm_loadu_si128(low.cast())),
+            _mm_loadu_si128(high.cast()),
+        )
+    }
 }

@@ -9,6 +9,40 @@ use std::arch::x86_64::*;
 use super::{Source, Warped};
 use crate::dense::kernels::Kernels;
 
+/// Blocks whose windows are placed at a time.
+const AHEAD: usize = 32;
+
+/// Where 16 pixels are interpolated.
+struct Place {
+    /// Disparity in 1/16 px.
+    steps: __m512i,
+    /// Column of the first tap.
+    first: __m512i,
+    phase: __m512i,
+    valid: __mmask16,
+}
+
+/// # Safety
+/// The processor has AVX-512; `i + 16` is at most the number of pixels.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq")]
+#[inline]
+unsafe fn place(source: &Source<'_>, i: usize, width: i32) -> Place {
+    let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    // SAFETY: the caller's promise.
+    let w = unsafe { _mm512_loadu_ps(source.w.as_ptr().add(i)) };
+    let steps = _mm512_cvtps_epi32(_mm512_mul_ps(w, _mm512_set1_ps(16.0)));
+    let x = _mm512_add_epi32(lane, _mm512_set1_epi32((source.x0 + i) as i32));
+    let at = _mm512_sub_epi32(_mm512_slli_epi32::<4>(x), steps);
+    let first = _mm512_sub_epi32(_mm512_srai_epi32::<4>(at), _mm512_set1_epi32(3));
+    let phase = _mm512_and_si512(at, _mm512_set1_epi32(15));
+    // False for NaN.
+    let near = _mm512_set1_ps(super::FARTHEST);
+    let known = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(_mm512_abs_ps(w), near);
+    let right_of = _mm512_cmpge_epi32_mask(first, _mm512_setzero_si512());
+    let left_of = _mm512_cmple_epi32_mask(first, _mm512_set1_epi32(width - 8));
+    Place { steps, first, phase, valid: known & right_of & left_of }
+}
+
 /// Does whole blocks, and returns the number of pixels done.
 ///
 /// # Safety
@@ -17,7 +51,6 @@ use crate::dense::kernels::Kernels;
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512vnni")]
 pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Warped<'_>) -> usize {
     let width = source.right[0].len() as i32;
-    let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
     // Per pair of taps, a register of the 16 phases' coefficient pairs.
     let mut table = [[0i32; 16]; 4];
     for (phase, taps) in kernels.taps.iter().enumerate() {
@@ -25,41 +58,46 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             t[phase] = i32::from(taps[2 * j] as u16) | i32::from(taps[2 * j + 1]) << 16;
         }
     }
-    // SAFETY: arrays of 64 bytes.
-    let table = unsafe { table.map(|t| _mm512_loadu_si512(t.as_ptr().cast())) };
+    let mut tables = [_mm512_setzero_si512(); 4];
+    for (to, t) in tables.iter_mut().zip(&table) {
+        // SAFETY: arrays of 64 bytes.
+        *to = unsafe { _mm512_loadu_si512(t.as_ptr().cast()) };
+    }
     let ones = _mm512_set1_epi16(1);
     let half = _mm512_set1_epi32(0x8000);
     let blocks = source.w.len() / 16;
+    // The windows' places first: finding one takes long, but many at a time overlap.
+    let mut bases = [0i32; AHEAD];
     for block in 0..blocks {
+        if block % AHEAD == 0 {
+            for (k, base) in bases.iter_mut().enumerate().take(blocks - block) {
+                // SAFETY: `block + k < blocks`.
+                let place = unsafe { place(source, (block + k) * 16, width) };
+                *base = _mm512_mask_reduce_min_epi32(place.valid, place.first);
+            }
+        }
         let i = block * 16;
         // SAFETY: `i + 16` is at most the number of pixels.
-        let w = unsafe { _mm512_loadu_ps(source.w.as_ptr().add(i)) };
-        let steps = _mm512_cvtps_epi32(_mm512_mul_ps(w, _mm512_set1_ps(16.0)));
-        let x = _mm512_add_epi32(lane, _mm512_set1_epi32((source.x0 + i) as i32));
-        let at = _mm512_sub_epi32(_mm512_slli_epi32::<4>(x), steps);
-        let first = _mm512_sub_epi32(_mm512_srai_epi32::<4>(at), _mm512_set1_epi32(3));
-        let phase = _mm512_and_si512(at, _mm512_set1_epi32(15));
-        // False for NaN.
-        let near = _mm512_set1_ps(super::FARTHEST);
-        let known = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(_mm512_abs_ps(w), near);
-        let right_of = _mm512_cmpge_epi32_mask(first, _mm512_setzero_si512());
-        let left_of = _mm512_cmple_epi32_mask(first, _mm512_set1_epi32(width - 8));
-        let valid = known & right_of & left_of;
-        let taps = table.map(|t| _mm512_permutexvar_epi32(phase, t));
+        let Place { steps, first, phase, valid } = unsafe { place(source, i, width) };
         let zero = _mm512_setzero_si512();
+        let mut taps = [zero; 4];
+        for (to, table) in taps.iter_mut().zip(tables) {
+            *to = _mm512_permutexvar_epi32(phase, table);
+        }
         let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
         let mut left = valid;
+        let mut base = bases[block % AHEAD];
         while left != 0 {
-            let base = _mm512_mask_reduce_min_epi32(left, first).min(width - 32);
+            base = base.min(width - 32);
             let offset = _mm512_sub_epi32(first, _mm512_set1_epi32(base));
             let now = _mm512_mask_cmple_epi32_mask(left, offset, _mm512_set1_epi32(24));
             left &= !now;
             // Both halves of a word hold the offset; then pairs of neighbouring samples.
             let both = _mm512_or_si512(offset, _mm512_slli_epi32::<16>(offset));
-            let pick: [__m512i; 4] = std::array::from_fn(|j| {
-                let j = j as i32;
-                _mm512_add_epi16(both, _mm512_set1_epi32(2 * j | (2 * j + 1) << 16))
-            });
+            let mut pick = [both; 4];
+            for (j, pick) in (0i32..).zip(&mut pick) {
+                *pick = _mm512_add_epi16(both, _mm512_set1_epi32(2 * j | (2 * j + 1) << 16));
+            }
             let (mut ig_now, mut g1_now, mut gg_now, mut lg_now) = (zero, zero, zero, zero);
             for (pair, rows) in source.right.chunks_exact(2).enumerate() {
                 let mut sums = [half; 2];
@@ -91,6 +129,9 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             g1 = _mm512_mask_mov_epi32(g1, now, g1_now);
             gg = _mm512_mask_mov_epi32(gg, now, gg_now);
             lg = _mm512_mask_mov_epi32(lg, now, lg_now);
+            if left != 0 {
+                base = _mm512_mask_reduce_min_epi32(left, first);
+            }
         }
         let used = _mm512_mul_ps(_mm512_cvtepi32_ps(steps), _mm512_set1_ps(1.0 / 16.0));
         // SAFETY: `i + 16` lies within every map.

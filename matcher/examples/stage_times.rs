@@ -1,0 +1,62 @@
+//! CPU time per stage of the fast path on a full synthetic frame: the minimum of repeats.
+//!
+//! `cargo run --release -p stspp-matcher --example stage_times [repeats] [level] [threads]`
+
+use stspp_matcher::{
+    DisparityRange, Image, Level, ShapeFunction,
+    coarse::{Coarse, CoarseMap, INVALID},
+    dense::{DenseFit, DenseMaps, mark_steps},
+    synthetic::Scene,
+};
+
+fn cpu_ms() -> f64 {
+    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: `t` is a valid timespec.
+    unsafe { libc::clock_gettime(libc::CLOCK_PROCESS_CPUTIME_ID, &mut t) };
+    t.tv_sec as f64 * 1e3 + t.tv_nsec as f64 / 1e6
+}
+
+fn main() {
+    let mut arguments = std::env::args().skip(1);
+    let repeats: usize = arguments.next().map_or(10, |a| a.parse().expect("a number"));
+    let level = arguments.next().map_or(Level::best(), |a| a.parse().expect("a level"));
+    let threads = arguments.next().map_or(1, |a| a.parse().expect("a number"));
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().expect("one pool");
+    let (w, h) = (1280, 1024);
+    let r = Scene::benchmark(w, h, 10, 40.0).render();
+    let mut coarse = Coarse::new(level, DisparityRange { min_px: -400, max_px: 119 });
+    let mut map = CoarseMap::new(w, h);
+    let mut start = Image::new(w, h, f32::NAN);
+    let mut step = Image::new(w, h, 0u8);
+    let mut maps = DenseMaps::new(w, h);
+    let mut first = DenseFit::new(level, 4, ShapeFunction::First, 1.5);
+    let mut auto = DenseFit::new(level, 4, ShapeFunction::Auto, 1.5);
+    let mut best = [f64::INFINITY; 6];
+    r.with_stack(|s| {
+        for _ in 0..repeats {
+            let mut t = cpu_ms();
+            let mut lap = |i: usize| {
+                let now = cpu_ms();
+                best[i] = best[i].min(now - t);
+                t = now;
+            };
+            coarse.describe(s);
+            lap(0);
+            coarse.search(s, false, &mut map);
+            lap(1);
+            coarse.search(s, true, &mut map);
+            lap(2);
+            for (to, d) in start.as_mut_slice().iter_mut().zip(map.disparity.as_slice()) {
+                *to = if *d == INVALID { f32::NAN } else { f32::from(*d) };
+            }
+            mark_steps(&start, 4, 1.5, &mut step);
+            lap(3);
+            first.fit(s, &start, &step, &mut maps);
+            lap(4);
+            auto.fit(s, &start, &step, &mut maps);
+            lap(5);
+        }
+    });
+    let flagged = step.as_slice().iter().filter(|v| **v != 0).count();
+    println!("{level} {threads} threads, CPU ms: describe {:.2} search {:.2} cleaned search {:.2} steps {:.2} first {:.2} both {:.2}; {flagged} flagged", best[0], best[1], best[2], best[3], best[4], best[5]);
+}
