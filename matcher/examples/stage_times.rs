@@ -49,7 +49,7 @@ fn main() {
             for (to, d) in start.as_mut_slice().iter_mut().zip(map.disparity.as_slice()) {
                 *to = if *d == INVALID { f32::NAN } else { f32::from(*d) };
             }
-            mark_steps(&start, 4, 1.5, &mut step);
+            mark_steps(level, &start, 4, 1.5, &mut step);
             lap(3);
             first.fit(s, &start, &step, &mut maps);
             lap(4);
@@ -58,5 +58,8 @@ fn main() {
         }
     });
     let flagged = step.as_slice().iter().filter(|v| **v != 0).count();
-    println!("{level} {threads} threads, CPU ms: describe {:.2} search {:.2} cleaned search {:.2} steps {:.2} first {:.2} both {:.2}; {flagged} flagged", best[0], best[1], best[2], best[3], best[4], best[5]);
+    println!(
+        "{level} {threads} threads, CPU ms: describe {:.2} search {:.2} cleaned search {:.2} steps {:.2} first {:.2} both {:.2}; {flagged} flagged",
+        best[0], best[1], best[2], best[3], best[4], best[5]
+    );
 }

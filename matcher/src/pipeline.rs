@@ -6,6 +6,7 @@ use crate::{
     Error, Image, Level, Matched, Method, Params, StageTime, StereoStack,
     census::PaddedStack,
     check,
+    fast::Fast,
     icgn::{field::Field, guess::CoarseMap, prepare::Prepared},
     parallel::Pool,
     search::{self, Coarse},
@@ -29,6 +30,8 @@ pub struct Matcher {
     prepared: Prepared,
     map: CoarseMap,
     field: Field,
+    /// Made by the first frame that needs it.
+    fast: Option<Fast>,
 }
 
 impl Matcher {
@@ -49,6 +52,7 @@ impl Matcher {
             prepared: Prepared::default(),
             map: CoarseMap::default(),
             field: Field::default(),
+            fast: None,
         })
     }
 
@@ -77,11 +81,7 @@ impl Matcher {
         pool.install(|| match self.params.method {
             Method::Parabola => Ok(self.parabola(stack)),
             Method::IcGn => Ok(self.icgn(stack)),
-            Method::Dense => Err(Error::Parameter {
-                name: "method",
-                got: format!("{:?}", self.params.method),
-                allowed: "Parabola or IcGn (Dense is not built in)".to_owned(),
-            }),
+            Method::Dense => Ok(self.dense(stack)),
         })
     }
 
@@ -97,6 +97,15 @@ impl Matcher {
         check::remove_small_regions(&mut coarse.disparity_px, self.params.advanced.region_min);
         clock.stage("check");
         coarse
+    }
+
+    /// Descriptors, their search, and dense least squares.
+    fn dense(&mut self, stack: &StereoStack<'_>) -> Matched {
+        let mut clock = Clock::start();
+        let Self { fast, level, params, .. } = self;
+        let fast = fast.get_or_insert_with(|| Fast::new(*level, params));
+        let (disparity_px, zncc) = fast.run(stack, |stage| clock.stage(stage));
+        Matched { disparity_px, zncc, rate_px_per_s: None, stages: clock.stages }
     }
 
     fn parabola(&mut self, stack: &StereoStack<'_>) -> Matched {

@@ -106,9 +106,8 @@ impl Scene {
             centre_px + 0.05 * u + 0.03 * v + cap + ridge
         };
         let step = move |x: f64, y: f64| base(x, y) + 6.0;
-        let inside = move |x: f64, y: f64| {
-            x > w * 0.65 && x < w * 0.9 && y > h * 0.6 && y < h * 0.85
-        };
+        let inside =
+            move |x: f64, y: f64| x > w * 0.65 && x < w * 0.9 && y > h * 0.6 && y < h * 0.85;
         Self::new(width, height, frames, vec![Layer::everywhere(base), Layer::patch(step, inside)])
     }
 
@@ -221,9 +220,10 @@ impl Scene {
                 let cy = random.unit() * h as f64;
                 let peak = self.peak_dn * (0.5 + random.unit());
                 let (y0, y1) = ((cy - reach).ceil().max(0.0), (cy + reach).floor());
-                for y in y0 as usize..=(y1.min(h as f64 - 1.0)) as usize {
+                let last = (y1.min(h as f64 - 1.0)) as usize;
+                for (y, row) in by_row.iter_mut().enumerate().take(last + 1).skip(y0 as usize) {
                     let dy = y as f64 - cy;
-                    by_row[y].push((cx, peak * (k * dy * dy).exp()));
+                    row.push((cx, peak * (k * dy * dy).exp()));
                 }
             }
             for (y, dots) in by_row.iter_mut().enumerate() {

@@ -5,10 +5,10 @@ use rayon::prelude::*;
 
 use super::{
     CoarseMap, INVALID,
-    descriptor::{Descriptors, MARGIN, vectorised},
+    descriptor::{Descriptors, MARGIN},
     search::UNSURE_COST,
 };
-use crate::{Image, Level};
+use crate::{Image, Level, lanes::vectorised};
 
 /// An outlier that matches better than its neighbours' disparity by more bits stays: a thin object.
 const THIN_BITS: u32 = 5;
@@ -39,8 +39,7 @@ pub(crate) fn replace_outliers(
                     cost.copy_from_slice(map.cost.row(y));
                     medians(level, &map.disparity, y, height, median);
                     for x in 0..width {
-                        if median[x].abs_diff(disparity[x]) > 1
-                            || u32::from(cost[x]) > UNSURE_COST
+                        if median[x].abs_diff(disparity[x]) > 1 || u32::from(cost[x]) > UNSURE_COST
                         {
                             let bits = |d: i32| distance(left, right, x, y, d);
                             settle(median[x], bits, &mut disparity[x], &mut cost[x]);
@@ -77,9 +76,9 @@ fn settle(median: i16, bits: impl Fn(i32) -> Option<u32>, disparity: &mut i16, c
 
 fn distance(left: &Descriptors, right: &Descriptors, x: usize, y: usize, d: i32) -> Option<u32> {
     let at = x as i64 - i64::from(d);
-    (0..left.width() as i64).contains(&at).then(|| {
-        (left.row(y)[MARGIN + x] ^ right.row(y)[MARGIN + at as usize]).count_ones()
-    })
+    (0..left.width() as i64)
+        .contains(&at)
+        .then(|| (left.row(y)[MARGIN + x] ^ right.row(y)[MARGIN + at as usize]).count_ones())
 }
 
 fn medians(level: Level, map: &Image<i16>, y: usize, height: usize, out: &mut [i16]) {

@@ -57,7 +57,7 @@ impl Coarse {
     /// A search over the given candidates.
     pub fn new(level: Level, range: DisparityRange) -> Self {
         Self {
-            level: level.trusted(),
+            level: level.usable(),
             range,
             left: Descriptors::default(),
             right: Descriptors::default(),

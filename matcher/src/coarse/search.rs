@@ -199,13 +199,7 @@ fn seed_row(scene: &Scene<'_>, y: usize, s: &mut Scratch, seeds: &mut [i16]) {
 }
 
 /// Searches a block of [`BLOCK`] x [`SEED_ROWS`] pixels from column `x`.
-fn search_block(
-    scene: &Scene<'_>,
-    seeds: &[i16],
-    x: usize,
-    s: &mut Scratch,
-    out: &mut Band<'_>,
-) {
+fn search_block(scene: &Scene<'_>, seeds: &[i16], x: usize, s: &mut Scratch, out: &mut Band<'_>) {
     let count = scene.count();
     let min = scene.range.min_px;
     let half = out.width.div_ceil(2);

@@ -16,18 +16,21 @@ pub(crate) mod gradient;
 pub mod kernels;
 pub(crate) mod moments;
 pub(crate) mod normalise;
+pub mod order;
 pub(crate) mod refit;
 pub(crate) mod solve;
 pub(crate) mod tile;
-pub(crate) mod warp;
 #[cfg(test)]
 mod timing;
+pub(crate) mod warp;
 
 use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, Sample, ShapeFunction, StereoStack};
+use crate::{
+    Image, Level, Sample, ShapeFunction, StereoStack, lanes::vectorised, params::RADIUS_LIMIT,
+};
 use solve::Fits;
 use tile::{Job, Output, Tile};
 
@@ -70,7 +73,7 @@ impl DenseFit {
     /// A fit with windows of 2 `radius` + 1 pixels a side; `radius` is brought to 2..=8.
     pub fn new(level: Level, radius: usize, shape: ShapeFunction, surface_px: f32) -> Self {
         Self {
-            level: level.trusted(),
+            level: level.usable(),
             radius: radius.clamp(2, 8),
             shape,
             surface_px,
@@ -149,31 +152,73 @@ fn origin(start: &Image<f32>) -> f32 {
 
 /// Marks the pixels whose window of `radius` holds a valid disparity more than `limit` px from their
 /// own.
-pub fn mark_steps(start: &Image<f32>, radius: usize, limit: f32, out: &mut Image<u8>) {
+pub fn mark_steps(
+    level: Level,
+    start: &Image<f32>,
+    radius: usize,
+    limit: f32,
+    out: &mut Image<u8>,
+) {
     let (width, height) = (start.width(), start.height());
+    let level = level.usable();
+    let radius = radius.min(RADIUS_LIMIT);
     if (out.width(), out.height()) != (width, height) {
         *out = Image::new(width, height, 0);
     }
     let data = out.as_mut_slice();
-    data.par_chunks_mut(width.max(1)).enumerate().for_each_init(
-        || [vec![0.0f32; width], vec![0.0f32; width]],
-        |[low, high], (y, marks)| {
-            low.fill(f32::INFINITY);
-            high.fill(f32::NEG_INFINITY);
-            for row in y.saturating_sub(radius)..(y + radius + 1).min(height) {
-                for ((lo, hi), &v) in low.iter_mut().zip(high.iter_mut()).zip(start.row(row)) {
-                    // NaN loses either comparison.
-                    *lo = if v < *lo { v } else { *lo };
-                    *hi = if v > *hi { v } else { *hi };
+    data.par_chunks_mut((width * 32).max(1)).enumerate().for_each_init(
+        || [vec![f32::INFINITY; width + 2 * radius], vec![f32::NEG_INFINITY; width + 2 * radius]],
+        |[low, high], (band, marks)| {
+            for (i, marks) in marks.chunks_mut(width).enumerate() {
+                let y = band * 32 + i;
+                let (top, end) = (y.saturating_sub(radius), (y + radius + 1).min(height));
+                let mut rows = [start.row(y); 2 * RADIUS_LIMIT + 1];
+                for (to, row) in rows.iter_mut().zip(top..end) {
+                    *to = start.row(row);
                 }
-            }
-            let own = start.row(y);
-            for x in 0..width {
-                let window = x.saturating_sub(radius)..(x + radius + 1).min(width);
-                let lo = low[window.clone()].iter().copied().fold(f32::INFINITY, f32::min);
-                let hi = high[window].iter().copied().fold(f32::NEG_INFINITY, f32::max);
-                marks[x] = u8::from(own[x] - lo > limit || hi - own[x] > limit);
+                vectorised!(
+                    level,
+                    mark_row(
+                        rows: &[&[f32]] = &rows[..end - top],
+                        own: &[f32] = start.row(y),
+                        limit: f32 = limit,
+                        low: &mut [f32] = low,
+                        high: &mut [f32] = high,
+                        marks: &mut [u8] = marks,
+                    )
+                );
             }
         },
     );
+}
+
+/// `low` and `high` hold the column extremes, with neutral values beyond the image's sides.
+#[inline(always)]
+fn mark_row(
+    rows: &[&[f32]],
+    own: &[f32],
+    limit: f32,
+    low: &mut [f32],
+    high: &mut [f32],
+    marks: &mut [u8],
+) {
+    let width = own.len();
+    let radius = (low.len() - width) / 2;
+    let (column_low, column_high) = (&mut low[radius..][..width], &mut high[radius..][..width]);
+    column_low.fill(f32::INFINITY);
+    column_high.fill(f32::NEG_INFINITY);
+    for row in rows {
+        for ((lo, hi), &v) in column_low.iter_mut().zip(column_high.iter_mut()).zip(*row) {
+            // NaN loses either comparison.
+            *lo = if v < *lo { v } else { *lo };
+            *hi = if v > *hi { v } else { *hi };
+        }
+    }
+    marks.fill(0);
+    for j in 0..2 * radius + 1 {
+        let window = low[j..j + width].iter().zip(&high[j..j + width]);
+        for ((mark, &own), (&lo, &hi)) in marks.iter_mut().zip(own).zip(window) {
+            *mark |= u8::from(own - lo > limit) | u8::from(hi - own > limit);
+        }
+    }
 }

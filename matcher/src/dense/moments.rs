@@ -133,6 +133,7 @@ fn horizontal5<V: Lanes>(
 }
 
 #[inline(always)]
+#[allow(clippy::needless_range_loop)]
 fn horizontal_lanes<V: Lanes, const K: usize>(
     row: &[f32],
     radius: usize,
@@ -170,6 +171,7 @@ fn horizontal_lanes<V: Lanes, const K: usize>(
 /// # Safety
 /// `i + COUNT` lies within every row, and there are 2 `radius` + 1 rows.
 #[inline(always)]
+#[allow(clippy::needless_range_loop)]
 pub(crate) unsafe fn vertical<V: Lanes, const L: usize, const R: usize>(
     rows: &[&[f32]],
     radius: usize,
@@ -225,7 +227,9 @@ mod tests {
                 for i in PAD..PAD + len {
                     let want: f64 = rows
                         .iter()
-                        .map(|r| r[i - radius..=i + radius].iter().map(|&v| f64::from(v)).sum::<f64>())
+                        .map(|r| {
+                            r[i - radius..=i + radius].iter().map(|&v| f64::from(v)).sum::<f64>()
+                        })
                         .sum();
                     assert!((f64::from(out[i]) - want).abs() < 1e-6 * want.abs() + 1e-9);
                     for (k, h) in h.iter().enumerate() {

@@ -143,6 +143,7 @@ unsafe fn store<V: Lanes>(flag: V::Mask, value: V, row: &mut [f32], i: usize) {
 /// # Safety
 /// `i - radius` and `i + radius + COUNT` lie within the rows, of which there are 2 radius + 1.
 #[inline(always)]
+#[allow(clippy::needless_range_loop)]
 unsafe fn sums<V: Lanes, const K: usize, const L: usize>(
     window: &Window<'_>,
     radius: usize,
@@ -188,7 +189,7 @@ unsafe fn sums<V: Lanes, const K: usize, const L: usize>(
 fn signed(powers: &Powers, k: usize, at: usize, radius: usize) -> f32 {
     if at >= radius {
         powers[k][at - radius]
-    } else if k % 2 == 0 {
+    } else if k.is_multiple_of(2) {
         powers[k][radius - at]
     } else {
         -powers[k][radius - at]

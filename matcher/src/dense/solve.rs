@@ -21,7 +21,11 @@ const SINGULAR: f32 = 1e-4;
 /// registers.
 macro_rules! each {
     ($name:ident in $($value:literal)* => $body:block) => {
-        $({ #[allow(unused)] const $name: usize = $value; $body })*
+        $({
+            #[allow(unused, clippy::absurd_extreme_comparisons)]
+            const $name: usize = $value;
+            $body
+        })*
     };
 }
 
@@ -29,6 +33,7 @@ macro_rules! each {
 /// variable is the constant: the solution of m a = e_last by L D L^T, in which the forward
 /// substitution falls away. NaN where singular.
 #[inline(always)]
+#[allow(clippy::absurd_extreme_comparisons)]
 pub(crate) fn inverse_row<V: Lanes, const N: usize>(mut m: [[V; N]; N]) -> [V; N] {
     const { assert!(N <= 6) };
     let one = V::splat(1.0);
@@ -83,6 +88,7 @@ const PHI_FIRST: [(usize, usize); FIRST] = [(1, 0), (0, 1), (0, 0)];
 /// Lower part of the second-order matrix over x, y, x^2, xy, y^2, 1, from moments of S: `m[a][b]` is
 /// that of x^a y^b.
 #[inline(always)]
+#[allow(clippy::absurd_extreme_comparisons)]
 pub(crate) fn second_matrix<V: Lanes>(m: &[[V; 5]; 5]) -> [[V; SECOND]; SECOND] {
     let mut matrix = [[V::splat(0.0); SECOND]; SECOND];
     each!(I in 0 1 2 3 4 5 => {
@@ -99,6 +105,7 @@ pub(crate) fn second_matrix<V: Lanes>(m: &[[V; 5]; 5]) -> [[V; SECOND]; SECOND] 
 
 /// Lower part of the first-order matrix over x, y, 1.
 #[inline(always)]
+#[allow(clippy::absurd_extreme_comparisons)]
 pub(crate) fn first_matrix<V: Lanes, const K: usize>(m: &[[V; K]; K]) -> [[V; FIRST]; FIRST] {
     let mut matrix = [[V::splat(0.0); FIRST]; FIRST];
     each!(I in 0 1 2 => {

@@ -319,13 +319,7 @@ impl Tile {
     /// Gain and offset, q, and horizontal moments of row `y`.
     fn normalise(&mut self, job: &Job<'_>, y: isize) {
         let (level, r, len) = (job.level, job.radius, self.len);
-        let terms = [
-            &self.first.valid,
-            &self.l_used,
-            &self.ll_used,
-            &self.first.g,
-            &self.first.gg,
-        ];
+        let terms = [&self.first.valid, &self.l_used, &self.ll_used, &self.first.g, &self.first.gg];
         for (ring, sum) in terms.into_iter().zip(&mut self.sums) {
             around(ring, y, r, |rows| {
                 box_sum(level, rows, r, len, &mut self.column, sum.row_mut(y));

@@ -82,7 +82,7 @@ macro_rules! dispatch {
         }
         match $level {
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: a trusted level was found on this processor (Level::trusted).
+            // SAFETY: a trusted level was found on this processor (Level::usable).
             crate::Level::Avx512 => unsafe { avx512($($value),*) },
             #[cfg(target_arch = "x86_64")]
             // SAFETY: as above.
@@ -94,3 +94,31 @@ macro_rules! dispatch {
     }};
 }
 pub(crate) use dispatch;
+
+/// Compiles a loop over slices per level: the compiler vectorises it with the level's registers.
+macro_rules! vectorised {
+    ($level:expr, $kernel:ident($($arg:ident : $ty:ty = $value:expr),* $(,)?)) => {{
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512vl,avx512dq")]
+        #[allow(clippy::too_many_arguments)]
+        fn avx512($($arg: $ty),*) {
+            $kernel($($arg),*)
+        }
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2,fma")]
+        #[allow(clippy::too_many_arguments)]
+        fn avx2($($arg: $ty),*) {
+            $kernel($($arg),*)
+        }
+        match $level {
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: a trusted level was found on this processor.
+            crate::Level::Avx512 => unsafe { avx512($($value),*) },
+            #[cfg(target_arch = "x86_64")]
+            // SAFETY: as above.
+            crate::Level::Avx2 => unsafe { avx2($($value),*) },
+            _ => $kernel($($value),*),
+        }
+    }};
+}
+pub(crate) use vectorised;

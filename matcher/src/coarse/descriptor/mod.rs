@@ -10,7 +10,7 @@ mod avx512;
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, Sample};
+use crate::{Image, Level, Sample, lanes::vectorised};
 
 /// Margin of right descriptor rows on both sides, so that whole blocks of candidates can be read.
 pub(crate) const MARGIN: usize = 64;
@@ -112,34 +112,6 @@ impl Descriptors {
         );
     }
 }
-
-/// Compiles a loop over slices per level: the compiler vectorises it with the level's registers.
-macro_rules! vectorised {
-    ($level:expr, $kernel:ident($($arg:ident : $ty:ty = $value:expr),* $(,)?)) => {{
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512vl,avx512dq")]
-        #[allow(clippy::too_many_arguments)]
-        fn avx512($($arg: $ty),*) {
-            $kernel($($arg),*)
-        }
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma")]
-        #[allow(clippy::too_many_arguments)]
-        fn avx2($($arg: $ty),*) {
-            $kernel($($arg),*)
-        }
-        match $level {
-            #[cfg(target_arch = "x86_64")]
-            // SAFETY: a trusted level was found on this processor.
-            crate::Level::Avx512 => unsafe { avx512($($value),*) },
-            #[cfg(target_arch = "x86_64")]
-            // SAFETY: as above.
-            crate::Level::Avx2 => unsafe { avx2($($value),*) },
-            _ => $kernel($($value),*),
-        }
-    }};
-}
-pub(crate) use vectorised;
 
 fn add_eighth(level: Level, row: &[Sample], light: &mut [i16]) {
     vectorised!(level, add_eighth_loop(row: &[Sample] = row, light: &mut [i16] = light));

@@ -2,7 +2,12 @@
 
 use super::{BLOCK, Rows};
 
-pub(super) fn blocks(rows: &Rows<'_>, mean: &[i16], at: impl Iterator<Item = usize>, out: &mut [u64]) {
+pub(super) fn blocks(
+    rows: &Rows<'_>,
+    mean: &[i16],
+    at: impl Iterator<Item = usize>,
+    out: &mut [u64],
+) {
     for from in at {
         for i in from..from + BLOCK {
             out[i] = rows.iter().enumerate().fold(0, |bits, (k, (row, other))| {

@@ -14,9 +14,8 @@ pub(super) unsafe fn search(
     shifts: &[i32],
     best: &mut [u32],
 ) {
-    let nibbles = _mm256_broadcastsi128_si256(_mm_setr_epi8(
-        0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4,
-    ));
+    let nibbles =
+        _mm256_broadcastsi128_si256(_mm_setr_epi8(0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4));
     let low = _mm256_set1_epi8(15);
     let zero = _mm256_setzero_si256();
     for block in 0..left.len() / BLOCK {
@@ -50,7 +49,8 @@ pub(super) unsafe fn search(
                 }
             }
             for (k, b) in b.into_iter().enumerate() {
-                let packed = _mm256_permutevar8x32_epi32(b, _mm256_setr_epi32(0, 2, 4, 6, 0, 0, 0, 0));
+                let packed =
+                    _mm256_permutevar8x32_epi32(b, _mm256_setr_epi32(0, 2, 4, 6, 0, 0, 0, 0));
                 // SAFETY: `at + 16` lies within `best`.
                 unsafe {
                     let to = best.as_mut_ptr().add(at + 4 * k).cast();

@@ -25,10 +25,7 @@ pub(super) unsafe fn blocks(
     }
     // SAFETY: arrays of 64 bytes.
     let order = unsafe {
-        [
-            _mm512_loadu_si512(order[0].as_ptr().cast()),
-            _mm512_loadu_si512(order[1].as_ptr().cast()),
-        ]
+        [_mm512_loadu_si512(order[0].as_ptr().cast()), _mm512_loadu_si512(order[1].as_ptr().cast())]
     };
     let c = [
         _mm512_set1_epi16(kernels.gradient[0]),

@@ -104,7 +104,8 @@ mod tests {
     #[test]
     fn levels_are_bit_equal() {
         let mut random = Random::new(3);
-        for (width, x0, len) in [(131, 0, 131), (131, 40, 91), (131, 40, 128), (5, 0, 16), (64, 1, 64)]
+        for (width, x0, len) in
+            [(131, 0, 131), (131, 40, 91), (131, 40, 128), (5, 0, 16), (64, 1, 64)]
         {
             let rows: Vec<Vec<Sample>> = (0..6)
                 .map(|_| (0..width).map(|_| (random.bits() % 16_321) as i16).collect())

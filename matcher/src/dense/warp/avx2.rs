@@ -32,7 +32,9 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
         let mut taps = [half; 4];
         for (j, taps) in taps.iter_mut().enumerate() {
             // SAFETY: a phase's taps are 16 bytes.
-            *taps = unsafe { two(kernels.taps[phase[j]].as_ptr(), kernels.taps[phase[j + 4]].as_ptr()) };
+            *taps = unsafe {
+                two(kernels.taps[phase[j]].as_ptr(), kernels.taps[phase[j + 4]].as_ptr())
+            };
         }
         // SAFETY: 32 bytes.
         let mask = unsafe { _mm256_loadu_si256(mask.as_ptr().cast()) };

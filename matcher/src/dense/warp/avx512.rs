@@ -96,7 +96,7 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             let both = _mm512_or_si512(offset, _mm512_slli_epi32::<16>(offset));
             let mut pick = [both; 4];
             for (j, pick) in (0i32..).zip(&mut pick) {
-                *pick = _mm512_add_epi16(both, _mm512_set1_epi32(2 * j | (2 * j + 1) << 16));
+                *pick = _mm512_add_epi16(both, _mm512_set1_epi32((2 * j) | ((2 * j + 1) << 16)));
             }
             let (mut ig_now, mut g1_now, mut gg_now, mut lg_now) = (zero, zero, zero, zero);
             for (pair, rows) in source.right.chunks_exact(2).enumerate() {

@@ -26,7 +26,8 @@ pub(super) fn pixels(
                         .map(|(&v, &c)| i32::from(v) * i32::from(c))
                         .fold(0x8000, i32::wrapping_add);
                     let g = sum >> 16;
-                    let of = |word: i32| if half == 0 { i32::from(word as i16) } else { word >> 16 };
+                    let of =
+                        |word: i32| if half == 0 { i32::from(word as i16) } else { word >> 16 };
                     ig = ig.wrapping_add(of(source.gradient[word]) * g);
                     lg = lg.wrapping_add(of(source.grey[word]) * g);
                     g1 = g1.wrapping_add(g);
