@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, BufReader, Write};
 use std::path::{Path, PathBuf};
 
-use png::{BitDepth, ColorType, Compression, Decoder, DecodingError, Encoder, Info};
+use png::{BitDepth, ColorType, Compression, Decoder, DecodingError, Encoder, EncodingError, Info};
 use stspp_matcher::Image;
 
 use crate::raw::{RawImage, RawPixels};
@@ -162,13 +162,18 @@ fn encode(
     encoder.set_color(color);
     encoder.set_depth(depth);
     encoder.set_compression(Compression::Fast);
-    for (keyword, text) in texts {
-        encoder.add_text_chunk((*keyword).into(), (*text).into())?;
-    }
-    let mut writer = encoder.write_header()?;
-    writer.write_image_data(data)?;
-    writer.finish()?;
-    Ok(())
+    let write = move || -> Result<(), EncodingError> {
+        for (keyword, text) in texts {
+            encoder.add_text_chunk((*keyword).into(), (*text).into())?;
+        }
+        let mut writer = encoder.write_header()?;
+        writer.write_image_data(data)?;
+        writer.finish()
+    };
+    write().map_err(|e| match e {
+        EncodingError::IoError(e) => e,
+        other => io::Error::other(other),
+    })
 }
 
 /// Writes an 8-bit grey PNG.

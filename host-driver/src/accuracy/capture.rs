@@ -1,39 +1,18 @@
 //! Recordings of simulated scenes with ideal timing: one projector a frame.
 
-use nalgebra::Isometry3;
 use stspp_hil_sim::world::{
-    CameraModel, LightInterval, LightSource, RawImage as SimImage, SceneSpec, SensorModel, World,
-    WorldError,
+    LightInterval, LightSource, RawImage as SimImage, SceneSpec, SensorModel, World, WorldError,
 };
 use stspp_matcher::Image;
 
+use crate::raw::RawPixels;
 use crate::recording::StereoPair;
-use crate::{CameraIntrinsics, RawImage, SlotLabel, StereoCalibration};
+use crate::sim::calibration_of;
+use crate::{RawImage, SlotLabel, StereoCalibration};
 
 /// The paper's timing: 30 frames a second, exposed for 32 ms.
 const FRAME_PERIOD_US: u64 = 33_333;
 const EXPOSURE_US: u64 = 32_000;
-
-fn intrinsics_of(camera: &CameraModel) -> CameraIntrinsics {
-    CameraIntrinsics {
-        focal_px: camera.focal_px,
-        principal_px: camera.principal_px,
-        radtan: camera.radtan,
-        resolution_px: [camera.width, camera.height],
-    }
-}
-
-/// The true calibration of a simulated sensor.
-pub fn calibration_of(model: &SensorModel) -> StereoCalibration {
-    let right_from_left: Isometry3<f64> = model.right_from_left;
-    StereoCalibration {
-        left: intrinsics_of(&model.left),
-        right: intrinsics_of(&model.right),
-        right_from_left,
-        temperature_c: None,
-        date: None,
-    }
-}
 
 /// A simulated camera's image as a real one's.
 pub fn raw_of(image: SimImage) -> RawImage {
@@ -99,6 +78,24 @@ impl Capture {
             });
         }
         Ok(Self { world, calibration, pairs, labels })
+    }
+
+    /// Part of the pixels, of both cameras, that are at full scale: their dots are cut off.
+    pub fn saturated(&self) -> f64 {
+        let (mut full, mut count) = (0_usize, 0_usize);
+        for image in self.pairs.iter().flat_map(|pair| [&pair.left, &pair.right]) {
+            let scale = image.full_scale();
+            full += match &image.pixels {
+                RawPixels::Gray8(pixels) => {
+                    pixels.as_slice().iter().filter(|v| u16::from(**v) >= scale).count()
+                }
+                RawPixels::Gray16(pixels) => {
+                    pixels.as_slice().iter().filter(|v| **v >= scale).count()
+                }
+            };
+            count += image.width() * image.height();
+        }
+        full as f64 / count.max(1) as f64
     }
 
     /// Centre of the recording's exposures `first..first + frames` in nanoseconds of the scene's time.

@@ -2,10 +2,11 @@
 //! truth behind every pixel.
 
 pub mod capture;
+pub mod maps;
 pub mod score;
 pub mod tables;
 pub mod truth;
 
-pub use capture::{Capture, calibration_of};
+pub use capture::Capture;
 pub use score::Score;
 pub use truth::CanvasTruth;

@@ -6,6 +6,7 @@ use stspp_matcher::{Error as MatchError, Matcher, Method, Params, ShapeFunction}
 
 use super::score::{central_plane_rms_mm, score, sphere_rms_mm};
 use super::{CanvasTruth, Capture, Score};
+use crate::DepthFrame;
 use crate::reconstruct::RectifiedStack;
 use crate::rectify::{DepthRange, Rectifier, RectifyError};
 
@@ -43,6 +44,7 @@ pub struct Setting {
 /// A scene, simulated and rectified, with the truth of its canvas.
 pub struct Case {
     capture: Capture,
+    saturated: f64,
     stack: RectifiedStack,
     truth: CanvasTruth,
 }
@@ -64,6 +66,8 @@ pub struct Line {
     pub radius_error_mm: Option<f64>,
     /// Against the truth.
     pub score: Score,
+    /// Part of the raw pixels at full scale.
+    pub saturated: f64,
     /// Wall time of the match in milliseconds.
     pub match_wall_ms: f64,
 }
@@ -90,6 +94,7 @@ impl Case {
     pub fn of_capture(mut capture: Capture) -> Result<Self, AccuracyError> {
         let rectifier = Rectifier::new(&capture.calibration, DepthRange::default())?;
         let stack = RectifiedStack::new(rectifier, &capture.pairs, capture.labels.clone())?;
+        let saturated = capture.saturated();
         // The raw images are not needed again, and there may be several cases.
         capture.pairs = Vec::new();
         let truth = CanvasTruth::trace(
@@ -98,7 +103,7 @@ impl Case {
             stack.rectifier.left_mask(),
             capture.centre_ns(0..stack.len()),
         );
-        Ok(Self { capture, stack, truth })
+        Ok(Self { capture, saturated, stack, truth })
     }
 
     /// Rectified images of the case.
@@ -111,7 +116,7 @@ impl Case {
         &self.truth
     }
 
-    /// Matches the first `frames` pairs and compares with the truth.
+    /// Matches the first `frames` pairs and compares with the truth. Also gives the depth frame.
     ///
     /// # Errors
     /// From the matcher.
@@ -120,7 +125,7 @@ impl Case {
         scene: &str,
         frames: usize,
         setting: Setting,
-    ) -> Result<Line, AccuracyError> {
+    ) -> Result<(Line, DepthFrame), AccuracyError> {
         let mut params = Params::new(self.stack.rectifier.disparity_range());
         params.method = setting.method;
         params.shape = setting.shape;
@@ -138,7 +143,7 @@ impl Case {
         } else {
             (None, None)
         };
-        Ok(Line {
+        let line = Line {
             scene: scene.to_owned(),
             frames,
             method: format!("{:?}", setting.method),
@@ -146,8 +151,10 @@ impl Case {
             fit_rms_mm,
             radius_error_mm,
             score: score(&frame, truth),
+            saturated: self.saturated,
             match_wall_ms,
-        })
+        };
+        Ok((line, frame))
     }
 }
 
@@ -169,14 +176,14 @@ pub fn to_text(lines: &[Line]) -> String {
         "match"
     );
     text += &format!(
-        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>8}\n",
-        "", "", "", "", "mm", "mm", "", "%", "%", "mm", "mm", "ms"
+        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>7} {:>8}\n",
+        "", "", "", "", "mm", "mm", "", "%", "%", "mm", "mm", "%", "ms"
     );
     let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.4}"));
     for line in lines {
         let score = &line.score;
         text += &format!(
-            "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9.3} {:>9.4} {:>9.4} {:>9.4} {:>8.0}\n",
+            "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9.3} {:>9.4} {:>9.4} {:>9.4} {:>7.3} {:>8.0}\n",
             line.scene,
             line.frames,
             line.method,
@@ -188,6 +195,7 @@ pub fn to_text(lines: &[Line]) -> String {
             100.0 * score.outliers,
             score.surface_rms_mm,
             score.surface_median_mm,
+            100.0 * line.saturated,
             line.match_wall_ms,
         );
     }

@@ -63,7 +63,11 @@ pub fn undistorted(camera: &CameraIntrinsics, pixel: [f64; 2]) -> [f64; 2] {
     let mut p = d;
     for _ in 0..500 {
         let e = distorted(camera.radtan, p[0], p[1]);
-        p = [p[0] + d[0] - e[0], p[1] + d[1] - e[1]];
+        let next = [p[0] + d[0] - e[0], p[1] + d[1] - e[1]];
+        if next == p {
+            break;
+        }
+        p = next;
     }
     p
 }

@@ -1,17 +1,21 @@
 //! `stspp bench`: time per stage, and accuracy against truth.
 
 mod accuracy;
+mod timing;
 
 use clap::Subcommand;
 
 use crate::exit::Failure;
 use crate::output::Output;
 
-/// Measure time per stage, or accuracy.
+/// Measure time per stage (the default), or accuracy.
 #[derive(clap::Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub struct Args {
     #[command(subcommand)]
-    what: What,
+    what: Option<What>,
+    #[command(flatten)]
+    timing: timing::Args,
 }
 
 #[derive(Subcommand)]
@@ -22,6 +26,7 @@ enum What {
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     match &args.what {
-        What::Accuracy(args) => accuracy::run(args, output),
+        Some(What::Accuracy(args)) => accuracy::run(args, output),
+        None => timing::run(&args.timing, output),
     }
 }

@@ -1,12 +1,17 @@
 //! `stspp bench accuracy`: the accuracy tables on the simulated sensor.
 
+use std::path::PathBuf;
+
 use serde_json::json;
+use stspp::accuracy::maps;
 use stspp::accuracy::tables::{self, AccuracyError, Case, Line, Setting};
+use stspp::export::folder::OutputFolder;
 use stspp_hil_sim::world::{SceneSpec, SensorModel};
+use stspp_matcher::Method;
 
 use crate::exit::{Failure, Kind};
 use crate::output::Output;
-use crate::reconstruct::Matching;
+use crate::reconstruct::{Matching, output_failure};
 
 /// Print accuracy against truth on the simulated sensor: sphere, planes, statue.
 #[derive(clap::Args)]
@@ -16,6 +21,9 @@ pub struct Args {
     /// Numbers of frames for the sphere.
     #[arg(long, value_delimiter = ',', default_value = "1,3,5,7,10")]
     counts: Vec<usize>,
+    /// Folder for error maps, one picture a line.
+    #[arg(long, value_name = "DIR")]
+    maps: Option<PathBuf>,
     /// Seed of the simulated sensor: other dots, tolerances and noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -43,6 +51,23 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let frames = args.matching.frames.unwrap_or(10);
     let spinner = output.spinner();
     let mut lines: Vec<Line> = Vec::new();
+    let mut folder = match &args.maps {
+        Some(path) => Some(OutputFolder::create(path, true).map_err(|e| output_failure(&e))?),
+        None => None,
+    };
+    let mut measure = |case: &Case, name: &str, frames: usize, setting: Setting| {
+        spinner.set_message(format!("{name}: matching {frames} frames"));
+        let (line, frame) = case.line(name, frames, setting).map_err(|e| failure(&e))?;
+        if let Some(folder) = &mut folder {
+            let method = format!("{:?}-{:?}", setting.method, setting.shape).to_lowercase();
+            let file = format!("{}-{frames}-{method}.png", name.replace(' ', "-"));
+            folder
+                .file(&file, |out| maps::write_error_png(out, &frame, case.truth(), 0.1))
+                .map_err(|e| output_failure(&e))?;
+        }
+        lines.push(line);
+        Ok::<(), Failure>(())
+    };
     let case = |scene: &str, options: &[(&str, &str)], frames: usize| {
         let spec = SceneSpec::parse(scene, options).map_err(AccuracyError::from)?;
         let model = SensorModel::with_seed(args.seed);
@@ -54,18 +79,26 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         let most = args.counts.iter().copied().max().unwrap_or(frames);
         let case = case("sphere", &[], most).map_err(|e| failure(&e))?;
         for &count in &args.counts {
-            spinner.set_message(format!("sphere: matching {count} frames"));
-            lines.push(case.line("sphere", count, setting).map_err(|e| failure(&e))?);
+            measure(&case, "sphere", count, setting)?;
         }
     }
     if wanted("planes") {
         for distance_m in ["1", "1.5", "2"] {
             let case =
                 case("plane", &[("distance_m", distance_m)], frames).map_err(|e| failure(&e))?;
-            spinner.set_message(format!("plane at {distance_m} m: matching"));
-            let name = format!("plane {distance_m} m");
-            lines.push(case.line(&name, frames, setting).map_err(|e| failure(&e))?);
+            measure(&case, &format!("plane {distance_m} m"), frames, setting)?;
         }
+    }
+    // The statue is scored for the parabola too: what the refinement brings is the point of it.
+    if wanted("statue") {
+        let case = case("statue", &[], frames).map_err(|e| failure(&e))?;
+        let parabola = Setting { method: Method::Parabola, ..setting };
+        for setting in [parabola, setting] {
+            measure(&case, "statue", frames, setting)?;
+        }
+    }
+    if let Some(folder) = folder {
+        folder.commit().map_err(|e| output_failure(&e))?;
     }
     spinner.finish_and_clear();
     output.result(&tables::to_text(&lines), &json!({ "seed": args.seed, "lines": lines }));
