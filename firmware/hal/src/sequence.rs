@@ -175,6 +175,32 @@ impl<'d> Sequence<'d> {
         })
     }
 
+    /// Takes back edge number `first` (counted since [`Sequence::start`]) and all after it.
+    pub fn retract(&mut self, first: u32) -> Result<(), ChainError> {
+        let time_cell = |event: u32| event.wrapping_sub(1) as usize % RING;
+        critical_section::with(|_| {
+            self.chain.update(dma::remaining(PORT_CHANNEL));
+            // SAFETY: cells in range; only this driver writes them.
+            let time = |event| unsafe {
+                RINGS.times.get().cast::<[u32; 2]>().add(time_cell(event)).read_volatile()[0]
+            };
+            let now = time_driver::counter();
+            let cell = self.chain.retract(now, first, time(first), time(first.wrapping_sub(1)))?;
+            let passed = now.wrapping_sub(1);
+            // SAFETY: as above; the channel reads either the old time, which lies ahead, or this.
+            unsafe {
+                RINGS.times.get().cast::<[u32; 2]>().add(cell).write_volatile([passed; 2]);
+            }
+            fence(Ordering::SeqCst);
+            if self.chain.must_arm(first, dma::remaining(PORT_CHANNEL)) {
+                let timer = regs::timer1();
+                timer.ch2cv.set(passed);
+                timer.ch3cv.set(passed);
+            }
+            Ok(())
+        })
+    }
+
     /// Number of edges that have happened since [`Sequence::start`].
     pub fn happened(&mut self) -> u32 {
         self.chain.update(dma::remaining(PORT_CHANNEL))

@@ -15,6 +15,7 @@
 //!
 //! * [`hardware`]: the two traits that a board implements, and what it reports.
 //! * [`timing`]: a validated timing compiled to timer ticks and gate words.
+//! * [`runner`]: a plan run on hardware that takes timed writes ahead.
 //! * [`sequencer`]: runs, frame numbers, generations, supervision of the engine.
 //! * [`interlock`]: faults that latch, and their conditions.
 //! * [`duty`]: how long each emitter may still be on.
@@ -43,6 +44,7 @@ pub mod duty;
 pub mod hardware;
 pub mod interlock;
 pub mod outbox;
+pub mod runner;
 pub mod sequencer;
 pub mod settings;
 pub mod timing;

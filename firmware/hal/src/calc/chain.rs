@@ -118,6 +118,29 @@ impl<const RING: usize> Chain<RING> {
         Ok(())
     }
 
+    /// Takes back event `first` and all after it: `first` is due at `at`, the event before it at
+    /// `previous_at`. Returns the time cell that must be overwritten with a passed time at once, so
+    /// that the chain parks there; after that, [`Chain::must_arm`] for `first` tells whether the
+    /// compare already holds `at` and must be parked by the CPU too.
+    pub const fn retract(
+        &mut self,
+        now: u32,
+        first: u32,
+        at: u32,
+        previous_at: u32,
+    ) -> Result<usize, ChainError> {
+        let kept = first.wrapping_sub(self.happened);
+        if kept >= self.appended.wrapping_sub(self.happened) {
+            return Err(ChainError::Late);
+        }
+        if (at.wrapping_sub(now) as i32) < MARGIN_TICKS as i32 {
+            return Err(ChainError::Late);
+        }
+        self.appended = first;
+        self.last_at = previous_at;
+        Ok(first.wrapping_sub(1) as usize % RING)
+    }
+
     /// Whether the compare must be armed by the CPU for event `event` (the first one just
     /// appended): true where everything before it has happened, because then the channel took a
     /// stale time. To be asked *after* the cells are stored, with a fresh remaining count: an
@@ -195,6 +218,27 @@ mod tests {
         Ok(())
     }
 
+    /// What the driver does to take edges back.
+    fn retract(
+        hw: &mut Hardware,
+        chain: &mut Chain<RING>,
+        first: u32,
+        at: u32,
+        previous_at: u32,
+        delays: [u32; 2],
+    ) -> Result<(), ChainError> {
+        chain.update(hw.remaining());
+        let passed = hw.now.wrapping_sub(1);
+        let cell = chain.retract(hw.now, first, at, previous_at)?;
+        (0..delays[0]).for_each(|_| hw.tick());
+        hw.times[cell] = passed;
+        if chain.must_arm(first, hw.remaining()) {
+            (0..delays[1]).for_each(|_| hw.tick());
+            hw.compare = passed;
+        }
+        Ok(())
+    }
+
     /// A small generator, so that the test needs no crate.
     struct Random(u64);
     impl Random {
@@ -241,6 +285,56 @@ mod tests {
             assert_eq!(hw.port, wanted, "seed {seed}");
             assert_eq!(chain.update(hw.remaining()), wanted.len() as u32);
         }
+    }
+
+    #[test]
+    fn what_is_retracted_never_happens_and_the_rest_does() {
+        let mut taken_back = 0;
+        for seed in 0..2_000 {
+            let mut random = Random(seed);
+            let mut hw = Hardware::new(0u32.wrapping_sub(150));
+            let mut chain = Chain::<RING>::new();
+            let mut wanted: Vec<(u32, u32)> = vec![];
+            let mut last = hw.now.wrapping_add(40);
+            let mut word = 0;
+            for _ in 0..12 {
+                let edges: Vec<Edge> = (0..4)
+                    .map(|_| {
+                        last = last.wrapping_add(10 + random.below(20));
+                        word += 1;
+                        Edge { at: last, word }
+                    })
+                    .collect();
+                let first = chain.appended();
+                append(&mut hw, &mut chain, &edges, [random.below(8), random.below(8)]).unwrap();
+                wanted.extend(edges.iter().map(|e| (e.at, e.word)));
+                (0..random.below(100)).for_each(|_| hw.tick());
+                let keep = random.below(4) as usize;
+                let victim = first + keep as u32;
+                let previous = wanted[..victim as usize].last().map_or(0, |e| e.0);
+                let delays = [random.below(8), random.below(8)];
+                let at = edges[keep].at;
+                let margin = at.wrapping_sub(hw.now) as i32;
+                let answer = retract(&mut hw, &mut chain, victim, at, previous, delays);
+                assert_eq!(answer.is_ok(), margin >= MARGIN_TICKS as i32, "seed {seed}");
+                if answer.is_ok() {
+                    taken_back += 1;
+                    wanted.truncate(victim as usize);
+                }
+                let soonest = hw.now.wrapping_add(MARGIN_TICKS);
+                last = wanted.last().map_or(soonest, |e| e.0);
+                if (last.wrapping_sub(soonest) as i32) < 0 {
+                    last = soonest;
+                }
+                while chain.free() < 4 {
+                    hw.tick();
+                    chain.update(hw.remaining());
+                }
+            }
+            (0..2_000).for_each(|_| hw.tick());
+            assert_eq!(hw.port, wanted, "seed {seed}");
+        }
+        assert!(taken_back > 1_000);
     }
 
     #[test]
