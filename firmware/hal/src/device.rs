@@ -70,13 +70,14 @@ pub use embassy_hal_internal::{Peri, PeripheralType};
 #[macro_export]
 macro_rules! bind_interrupts {
     ($(#[$attr:meta])* $vis:vis struct $name:ident {
-        $($irq:ident => $($handler:ty),*;)*
+        $($(#[cfg($condition:meta)])? $irq:ident => $($handler:ty),*;)*
     }) => {
         #[derive(Copy, Clone)]
         $(#[$attr])*
         $vis struct $name;
 
         $(
+            $(#[cfg($condition)])?
             #[allow(non_snake_case)]
             #[unsafe(no_mangle)]
             unsafe extern "C" fn $irq() {
@@ -90,13 +91,16 @@ macro_rules! bind_interrupts {
                 )*
             }
 
-            $(
-                // SAFETY: the handler above calls it.
-                unsafe impl $crate::interrupt::typelevel::Binding<
-                    $crate::interrupt::typelevel::$irq,
-                    $handler,
-                > for $name {}
-            )*
+            $(#[cfg($condition)])?
+            const _: () = {
+                $(
+                    // SAFETY: the handler above calls it.
+                    unsafe impl $crate::interrupt::typelevel::Binding<
+                        $crate::interrupt::typelevel::$irq,
+                        $handler,
+                    > for $name {}
+                )*
+            };
         )*
     };
 }

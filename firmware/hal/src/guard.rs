@@ -31,8 +31,12 @@ unsafe impl Sync for Word {}
 static OFF_WORD: Word = Word(UnsafeCell::new(0));
 static TRIPPED: AtomicBool = AtomicBool::new(false);
 
-/// Longest guarded time in microseconds (16-bit counter at 1 MHz).
-pub const MAX_US: u32 = 65_536;
+/// Ticks a second.
+const TICK_HZ: u32 = 100_000;
+/// Microseconds a tick.
+const TICK_US: u32 = 1_000_000 / TICK_HZ;
+/// Longest guarded time in microseconds (16-bit counter).
+pub const MAX_US: u32 = 65_536 * TICK_US;
 
 /// The driver. Arming is by free functions, because the interrupt that sees the edges does it.
 pub struct Guard<'d> {
@@ -41,22 +45,18 @@ pub struct Guard<'d> {
 }
 
 impl<'d> Guard<'d> {
-    /// Prepares the one-shot: `limit_us` after [`arm`], `off_word` is written to the port of `pin`.
-    ///
-    /// # Panics
-    /// When `limit_us` is 0 or more than [`MAX_US`].
+    /// Prepares the one-shot: when the time given to [`arm`] is over, `off_word` is written to the
+    /// port of `pin`.
     pub fn new(
         timer: Peri<'d, TIMER0>,
         channel: Peri<'d, DMA_CH4>,
         pin: &Output<'_>,
         off_word: u32,
-        limit_us: u32,
         priority: Priority,
         _irq: impl typelevel::Binding<typelevel::TIMER0_BRK_UP_TRG_COM, InterruptHandler>,
     ) -> Self {
-        assert!(limit_us > 0 && limit_us <= MAX_US, "guard limit");
-        let Some(prescaler) = timing::prescaler(crate::rcu::clocks().timer_hz, 1_000_000) else {
-            panic!("the timer clock is no whole number of megahertz")
+        let Some(prescaler) = timing::prescaler(crate::rcu::clocks().timer_hz, TICK_HZ) else {
+            panic!("the timer clock is no multiple of 100 kHz")
         };
         let rcu = regs::rcu();
         rcu.apb2en.modify(|_, w| w.timer0en().set_bit());
@@ -67,7 +67,7 @@ impl<'d> Guard<'d> {
 
         let timer_regs = regs::timer0();
         timer_regs.psc.set(u32::from(prescaler));
-        timer_regs.car.set(limit_us - 1);
+        timer_regs.car.set(0xffff);
         timer_regs.ctl0.set(UPS | SPM);
         timer_regs.swevg.write(|w| w.upg().set_bit());
         timer_regs.intf.set(0);
@@ -89,27 +89,26 @@ impl<'d> Guard<'d> {
     }
 }
 
-/// Starts the time anew.
+/// Starts the time anew: at least `limit_us` (at most [`MAX_US`]), at most a tick more.
 #[inline(always)]
-pub fn arm() {
+pub fn arm(limit_us: u32) {
+    let ticks = limit_us.min(MAX_US - TICK_US).div_ceil(TICK_US) + 1;
     let timer = regs::timer0();
     timer.ctl0.set(UPS | SPM);
+    timer.car.set(ticks - 1);
     timer.cnt.set(0);
     timer.ctl0.set(UPS | SPM | CEN);
-}
-
-/// Starts the time if it is not running.
-#[inline(always)]
-pub fn arm_if_idle() {
-    if regs::timer0().ctl0.get() & CEN == 0 {
-        arm();
-    }
 }
 
 /// Stops it: there is nothing to guard.
 #[inline(always)]
 pub fn disarm() {
     regs::timer0().ctl0.set(UPS | SPM);
+}
+
+/// Whether it has ended something since the last [`take_tripped`].
+pub fn is_tripped() -> bool {
+    TRIPPED.load(Ordering::Acquire)
 }
 
 /// Whether it has ended something since the last call.

@@ -53,8 +53,11 @@ impl Default for Config {
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[non_exhaustive]
 pub enum Error {
-    /// The ring was overwritten before it was read; what came is lost.
-    Overrun,
+    /// The ring was overwritten before it was read.
+    Overrun {
+        /// Bytes lost.
+        lost: u32,
+    },
     /// The DMA met a bus error.
     Dma,
 }
@@ -62,7 +65,7 @@ pub enum Error {
 impl core::fmt::Display for Error {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         f.write_str(match self {
-            Self::Overrun => "receive ring overwritten before it was read",
+            Self::Overrun { .. } => "receive ring overwritten before it was read",
             Self::Dma => "bus error of the DMA",
         })
     }
@@ -293,8 +296,9 @@ impl<T: Instance> Reader<T> {
                 self.reader.written(laps, remaining, pending)
             });
             fence(Ordering::SeqCst);
-            let Ok(range) = self.reader.available(written) else {
-                return Poll::Ready(Err(Error::Overrun));
+            let range = match self.reader.available(written) {
+                Ok(range) => range,
+                Err(overrun) => return Poll::Ready(Err(Error::Overrun { lost: overrun.lost })),
             };
             if range.is_empty() {
                 return Poll::Pending;
