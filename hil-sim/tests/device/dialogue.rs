@@ -308,29 +308,78 @@ fn unknown_and_malformed_messages_are_answered() {
     host.call(&Arm).unwrap();
 }
 
+/// A million bytes of noise and of frames with something changed: no light, and still answering.
 #[test]
 fn garbage_is_survived() {
-    let mut host = Host::connected();
-    let mut noise = 0x1234_5678_9ABC_DEF0_u64;
-    for round in 0..200 {
-        let bytes: Vec<u8> = (0..round * 7 % 500)
-            .map(|_| {
-                noise ^= noise << 13;
-                noise ^= noise >> 7;
-                noise ^= noise << 17;
-                noise as u8
-            })
-            .collect();
-        host.send_raw(&bytes);
-        host.run(MS);
+    for board in [BoardKind::F330, BoardKind::F350] {
+        let mut host = Host::on(board);
+        host.hello().unwrap();
+        let mut noise = 0x1234_5678_9ABC_DEF0_u64;
+        let mut next = || {
+            noise ^= noise << 13;
+            noise ^= noise >> 7;
+            noise ^= noise << 17;
+            noise
+        };
+        let mut out = [0; MAX_FRAME_LEN];
+        let requests = [
+            Request::Arm(Arm),
+            Request::StartStream(StartStream),
+            Request::SetTiming(SetTiming { timing: ProjectionTiming::default() }),
+            Request::FloodlightOn(FloodlightOn { duration_us: 400_000 }),
+        ];
+        let mut sent = 0;
+        while sent < 1_000_000 {
+            let mut bytes = Vec::new();
+            if next().is_multiple_of(2) {
+                bytes.extend((0..next() % 2_000).map(|_| next() as u8));
+            } else {
+                for _ in 0..next() % 40 {
+                    let request = &requests[(next() % 4) as usize];
+                    let mut frame = request.encode(next() as u16, &mut out).unwrap().to_vec();
+                    // One bit of one byte, but never so that the frame is cut: a good half of two
+                    // frames would be a frame.
+                    let at = (next() % (frame.len() as u64 - 1)) as usize;
+                    let flipped = frame[at] ^ 1 << (next() % 8);
+                    frame[at] = if flipped == 0 { frame[at] ^ 0x81 } else { flipped };
+                    bytes.append(&mut frame);
+                }
+            }
+            sent += bytes.len();
+            host.send_raw(&bytes);
+            host.run(MS);
+        }
         // A zero ends whatever the noise began.
         host.send_raw(&[0]);
-        host.call(&Heartbeat).unwrap();
+        let status = host.call(&GetStatus).unwrap();
+        assert!(host.edges.is_empty(), "no light from noise");
+        assert_eq!(status.state, DeviceState::Idle);
+        assert!(status.link.frames_rejected > 10_000, "{:?}", status.link);
+        host.call(&Arm).unwrap();
+        host.burst(1);
+        host.run(50 * MS);
+        assert_eq!(host.triggers().len(), 1);
     }
-    assert!(host.edges.is_empty(), "no light from noise");
-    let link = host.call(&GetStatus).unwrap().link;
-    assert!(link.frames_rejected > 100, "{link:?}");
-    assert!(link.frames_received > 200);
+}
+
+/// More events than their count of 16 bits has room for, and time far beyond 32 bits of nanoseconds.
+#[test]
+fn event_numbers_wrap() {
+    let mut host = Host::armed();
+    host.set_timing(&ProjectionTiming {
+        frame_period_us: 1_000,
+        exposure_us: 500,
+        ..ProjectionTiming::default()
+    });
+    host.call(&StartStream).unwrap();
+    host.run_alive(70 * S);
+    let stop = host.call(&StopStream).unwrap();
+    host.run(2 * MS);
+    let frames: Vec<u32> = host.triggers().iter().map(|event| event.frame_sequence).collect();
+    assert!(frames.iter().copied().eq(0..stop.end_frame_sequence));
+    assert!(frames.len() > 69_000);
+    let steps = host.event_seqs.windows(2);
+    assert!(steps.into_iter().all(|pair| pair[1] == pair[0].wrapping_add(1)));
 }
 
 #[test]

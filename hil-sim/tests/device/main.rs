@@ -4,5 +4,6 @@ mod dialogue;
 mod edges;
 mod faults;
 mod host;
+mod model;
 mod safety;
 mod settings;
