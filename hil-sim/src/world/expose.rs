@@ -109,7 +109,7 @@ impl Lights {
 }
 
 /// Movement within one sub-exposure, as a share of a pixel at 1 m, below which it is not divided.
-const SHARP_PX: f64 = 0.5;
+const SHARP_PX: f64 = 1.0;
 /// Most sub-exposures of one light.
 const MOST_SUB_EXPOSURES: u64 = 16;
 
@@ -274,7 +274,7 @@ impl CameraUnit {
                     m.read_noise_e as f32,
                 );
                 let dn = e.min(full_well) * gain + black;
-                *out = dn.round().clamp(0.0, top) as u16;
+                *out = (dn + 0.5).clamp(0.0, top) as u16;
             }
         });
         RawImage { width: m.width, height: m.height, bits: m.bits, data }

@@ -61,12 +61,14 @@ pub(crate) struct Sample {
     normal: [i16; 3],
     albedo: u16,
     object: u16,
+    is_edge: bool,
 }
 
 const NO_OBJECT: u16 = u16::MAX;
 
 impl Sample {
-    const NOTHING: Self = Self { point: [0.0; 3], normal: [0; 3], albedo: 0, object: NO_OBJECT };
+    const NOTHING: Self =
+        Self { point: [0.0; 3], normal: [0; 3], albedo: 0, object: NO_OBJECT, is_edge: false };
 
     pub fn is_surface(&self) -> bool {
         self.object != NO_OBJECT
@@ -89,8 +91,13 @@ impl Sample {
         f64::from(self.albedo) * (1.0 / 65535.0)
     }
 
+    /// Whether a neighbouring cell shows another piece of surface.
+    pub fn is_edge(&self) -> bool {
+        self.is_edge
+    }
+
     /// Whether the surface between two neighbouring samples is one smooth piece.
-    pub fn continues_to(&self, other: &Self) -> bool {
+    fn continues_to(&self, other: &Self) -> bool {
         if self.object != other.object {
             return false;
         }
@@ -147,6 +154,9 @@ impl GBuffer {
                 })
             })
             .collect();
+        for &index in &refined {
+            cells[index as usize].is_edge = true;
+        }
         let mut fine = vec![Sample::NOTHING; refined.len() * FINE_SAMPLES];
         fine.par_chunks_mut(FINE_SAMPLES).zip(&refined).for_each(|(samples, &index)| {
             let (row, column) = (index as usize / columns, index as usize % columns);
@@ -174,5 +184,6 @@ fn look(scene: &PosedScene<'_>, ray: &Ray) -> Sample {
         normal: [hit.normal.x, hit.normal.y, hit.normal.z].map(|v| (v * 32767.0).round() as i16),
         albedo: (albedo * 65535.0).round() as u16,
         object: object as u16,
+        is_edge: false,
     }
 }

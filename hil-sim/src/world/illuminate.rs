@@ -153,7 +153,7 @@ impl Shader<'_> {
             for px in 0..across {
                 let first = 2 * py * width + 2 * px;
                 let sample = block.samples[first];
-                if cells_of(px, py).all(|i| sample.continues_to(&block.samples[i])) {
+                if cells_of(px, py).all(|i| !block.samples[i].is_edge()) {
                     let is_lit = self.is_reached(&sample);
                     cells_of(px, py).for_each(|i| block.is_lit[i] = is_lit);
                 } else {

@@ -153,6 +153,51 @@ impl SensorModel {
         Self::assemble(left, right, rig_from_right.inverse() * rig_from_left, seed)
     }
 
+    /// A sensor of another make: other optics, noise and mounting, and projectors with clumpier,
+    /// unequal dots on smaller, more numerous tiles. Nothing may be tuned to one sensor's details;
+    /// this one shows whether something was.
+    #[must_use]
+    pub fn alternate(seed: u64) -> Self {
+        let left = CameraModel {
+            focal_px: [1795.3, 1797.1],
+            principal_px: [622.8, 531.2],
+            radtan: [0.0487, -0.1216, -4.1e-4, 6.2e-4],
+            vignetting_exponent: 5.5,
+            blur_sigma_px: 0.72,
+            full_well_e: 8_000.0,
+            read_noise_e: 5.0,
+            gain_dn_per_e: 0.0322,
+            black_level_dn: 6.0,
+            prnu: 0.006,
+            ..Self::with_seed(seed).left
+        };
+        let right = CameraModel {
+            focal_px: [1803.9, 1802.2],
+            principal_px: [655.1, 498.6],
+            radtan: [0.0532, -0.1301, 2.7e-4, -3.5e-4],
+            gain_dn_per_e: 0.0298,
+            black_level_dn: 3.5,
+            ..left.clone()
+        };
+        let rig_from_left = rig_from_camera(-0.1925, 8.8, [0.0, 0.0], [0.0, 0.0]);
+        let rig_from_right = rig_from_camera(0.1925, -9.3, [-1.8e-3, 2.3e-3], [-0.33, 0.41]);
+        let right_from_left = rig_from_right.inverse() * rig_from_left;
+        let mut model = Self::assemble(left, right, right_from_left, key(seed, 0xa17));
+        for projector in &mut model.projectors {
+            projector.emitters = 330;
+            projector.emitter_min_distance = 0.35;
+            projector.tile_pitch = projector.tile_pitch.map(|p| p * 0.675);
+            projector.doe_orders = [9, 8];
+            projector.dot_divergence_rad *= 1.08;
+            projector.aperture_sigma_m = 1.5e-4;
+            projector.peak_e_per_s *= 0.8;
+            projector.zero_order_gain = 1.35;
+            projector.copy_variation = 0.12;
+            projector.emitter_variation = 0.15;
+        }
+        model
+    }
+
     /// The same sensor with `1/factor` of the pixels in each direction and dots that many times
     /// larger, for fast tests: images look alike pixel for pixel, over the same field.
     ///
