@@ -94,6 +94,11 @@ impl Matcher {
         clock.stage("search");
         let searched = coarse.disparity_px.clone();
         check::median_3x3(&searched, &mut coarse.disparity_px);
+        if let Some(mask) = stack.left_mask {
+            // The median closes gaps, also those that the mask makes.
+            let pixels = coarse.disparity_px.as_mut_slice().iter_mut().zip(mask.as_slice());
+            pixels.filter(|(_, m)| **m == 0).for_each(|(d, _)| *d = f32::NAN);
+        }
         check::remove_small_regions(&mut coarse.disparity_px, self.params.advanced.region_min);
         clock.stage("check");
         coarse

@@ -6,6 +6,10 @@ use crate::cost::{CostKernel, CostLine, NO_CANDIDATE};
 /// pixels wide, so that a shift of two pixels still resembles the match.
 pub const VALLEY: usize = 2;
 
+/// Fewest bits that the runner-up must be worse by: with short descriptors, a part of the bits is less
+/// than chance alone gives one of hundreds of candidates.
+pub const MARGIN_MIN: f32 = 4.0;
+
 /// The best candidate of a pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Winner {
@@ -18,9 +22,10 @@ pub struct Winner {
 }
 
 impl Winner {
-    /// Whether every candidate outside the valley is worse by at least `margin` bits.
+    /// Whether every candidate outside the valley is worse by at least `margin` bits, and
+    /// [`MARGIN_MIN`].
     pub fn is_unique(&self, margin: f32) -> bool {
-        self.runner_up as f32 - self.cost as f32 >= margin.max(1.0)
+        self.runner_up as f32 - self.cost as f32 >= margin.max(MARGIN_MIN)
     }
 }
 

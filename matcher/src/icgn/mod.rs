@@ -21,7 +21,7 @@ use window::Window;
 pub const DRIFT_LIMIT_PX: f64 = 2.0;
 
 /// How far a grown pixel may be from its neighbour's prediction: it is to continue the surface.
-pub const GROWTH_STEP_PX: f64 = 0.5;
+pub const GROWTH_STEP_PX: f64 = 1.0;
 
 /// Subsets with a smaller part of their square than this are fitted to first order: half a square
 /// hardly tells curvature from slope.
@@ -191,7 +191,12 @@ impl<'a> Refiner<'a> {
             return false;
         }
         let shape = &refined.shape;
-        let radius = if self.prepared.frames >= 5 { 1 } else { 2 };
+        // Enough samples that chance agreement is rare: at least 49, and 72 from three frames on.
+        let radius = match self.prepared.frames {
+            ..=2 => 3,
+            3..=7 => 2,
+            _ => 1,
+        };
         scratch.select(radius, self.prepared, |dx, dy| {
             let (px, py) = (x as i64 + dx as i64, y as i64 + dy as i64);
             let inside = (0..self.prepared.width as i64).contains(&px)
