@@ -7,3 +7,4 @@ mod host;
 mod model;
 mod safety;
 mod settings;
+mod twin;

@@ -4,14 +4,12 @@
 //! compare values put them.
 
 use stspp_firmware_logic::hardware::{Aborted, GateEngine, SlotDone};
+use stspp_firmware_logic::runner::START_LEAD_US;
 use stspp_firmware_logic::timing::{GateWord, SlotPlan};
 use stspp_protocol::usb::SOF_MODULUS;
 
 use super::clock::DeviceClock;
 use crate::device::{Line, PinEdge};
-
-/// From a start request to slot 0: what the firmware takes to set up timer and DMA.
-pub const START_LEAD_US: u64 = 20;
 
 /// Cameras that are triggered, both at once.
 const CAMERAS: u8 = 2;
@@ -246,7 +244,7 @@ impl GateEngine for VirtualEngine {
         if let Some(pending) = self.pending.take() {
             self.plan = Some(pending);
         }
-        let start_us = self.time_us() + 1 + START_LEAD_US;
+        let start_us = self.time_us() + START_LEAD_US;
         self.run = Some(Run {
             slot_start_us: start_us,
             slot_number: 0,
