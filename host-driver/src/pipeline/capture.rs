@@ -15,6 +15,7 @@ use crate::camera::CameraFrame;
 use crate::clock::duration_ns;
 use crate::error::{Error, Faulted, Missing, Timeout};
 use crate::sensor::Session;
+use crate::sync::pairer::Reject;
 use crate::sync::{Side, Trigger};
 use crate::{ProjectionTiming, SlotLabel};
 
@@ -175,6 +176,7 @@ impl Capture {
             }
         };
         if !sent {
+            self.progress.count(|s| s.rejected.count(Reject::Discarded));
             self.progress.end_work();
         }
         Ok(sent)

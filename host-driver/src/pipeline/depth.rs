@@ -25,6 +25,21 @@ struct Rectified {
     right: Image<Sample>,
 }
 
+/// How a stream matches.
+#[derive(Debug, Clone)]
+pub struct MatchInfo {
+    /// The matcher's parameters.
+    pub params: Params,
+    /// Threads of the matcher.
+    pub threads: usize,
+    /// SIMD level of the matcher.
+    pub simd: &'static str,
+    /// Canvas pixels that the left camera sees: what completeness is a part of.
+    pub seen_pixels: usize,
+    /// Canvas pixels that the left camera sees (non-zero).
+    pub left_mask: Image<u8>,
+}
+
 /// Slots of a cycle, and which of them are matched.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Cycle {
@@ -89,9 +104,16 @@ impl DepthEngine {
         self
     }
 
-    /// Canvas pixels that the left camera saw.
-    pub fn seen_pixels(&self) -> usize {
-        self.rectifier.left_mask().as_slice().iter().filter(|seen| **seen != 0).count()
+    /// What is known before the first frame.
+    pub fn info(&self) -> MatchInfo {
+        let left_mask = self.rectifier.left_mask().clone();
+        MatchInfo {
+            params: self.matcher.params().clone(),
+            threads: self.matcher.threads(),
+            simd: self.matcher.level().name(),
+            seen_pixels: left_mask.as_slice().iter().filter(|seen| **seen != 0).count(),
+            left_mask,
+        }
     }
 
     /// Starts over with pairs of another timing.

@@ -34,6 +34,7 @@ use crate::reconstruct::Options as MatchOptions;
 use crate::sync::FrameStamp;
 use crate::{RawImage, SlotLabel};
 
+pub use depth::MatchInfo;
 pub use stats::StreamStats;
 pub use stream::{DepthStream, PairStream, StopHandle};
 
@@ -42,6 +43,9 @@ pub(crate) const CAPTURE_QUEUE: usize = 32;
 
 /// Pairs between pairing and matching: a whole window, so that a slow match loses no pair.
 pub(crate) const PAIR_QUEUE: usize = 20;
+
+/// The same two where the source waits: no longer than keeps the threads busy.
+pub(crate) const LOSSLESS_QUEUE: usize = 3;
 
 /// Depth frames that wait for the user. Older ones make room for newer ones.
 pub(crate) const DEPTH_QUEUE: usize = 2;

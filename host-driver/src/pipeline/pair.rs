@@ -8,15 +8,17 @@ use crossbeam_channel::{Receiver, Sender, TrySendError};
 use super::LabelledPair;
 use super::capture::Captured;
 use super::stats::{Mark, Progress};
+use super::stream::StopHandle;
 use crate::camera::CameraFrame;
 use crate::error::Error;
 use crate::sync::Side;
-use crate::sync::pairer::{Outcome, Pair, Pairer, PairerConfig};
+use crate::sync::pairer::{Outcome, Pair, Pairer, PairerConfig, Reject};
 
 pub(crate) struct PairThread {
     pub input: Receiver<Captured>,
     pub out: Sender<Result<LabelledPair, Error>>,
     pub progress: Arc<Progress>,
+    pub stop: StopHandle,
     pub config: PairerConfig,
     /// Wait for the matcher instead of dropping pairs.
     pub lossless: bool,
@@ -61,6 +63,14 @@ impl PairThread {
             }
             if !going_on {
                 break;
+            }
+        }
+        // Capture ends soon; what it still had is counted.
+        self.stop.stop();
+        for item in self.input.iter() {
+            if let Captured::Frame(_) = item {
+                self.progress.count(|s| s.rejected.count(Reject::Discarded));
+                self.progress.end_work();
             }
         }
         pairer.finish(&mut outcomes);

@@ -8,11 +8,11 @@ use std::time::Duration;
 use crossbeam_channel::{Receiver, RecvTimeoutError, bounded};
 
 use super::capture::{self, Capture};
-use super::depth::{Cycle, Cycles, DepthEngine, MatchThread};
+use super::depth::{Cycle, Cycles, DepthEngine, MatchInfo, MatchThread};
 use super::pair::PairThread;
 use super::replay::Replay;
 use super::stats::{Progress, StreamStats};
-use super::{CAPTURE_QUEUE, DEPTH_QUEUE, LabelledPair, PAIR_QUEUE, StreamOptions};
+use super::{CAPTURE_QUEUE, DEPTH_QUEUE, LOSSLESS_QUEUE, LabelledPair, PAIR_QUEUE, StreamOptions};
 use crate::clock::{Clock, duration_ns};
 use crate::error::{Error, Missing, Timeout};
 use crate::sensor::{Lease, Session};
@@ -74,11 +74,12 @@ impl Threads {
         stats
     }
 
-    /// The next result, waiting up to `timeout` of the source's clock.
+    /// The next result, waiting up to `timeout` of the source's clock; `observe` is called meanwhile.
     fn next<T>(
         &mut self,
         results: &Results<T>,
         timeout: Option<Duration>,
+        observe: &mut dyn FnMut(&StreamStats),
     ) -> Option<Result<T, Error>> {
         let start_ns = self.clock.now_ns();
         let deadline_ns = timeout.map(|timeout| start_ns.saturating_add(duration_ns(timeout)));
@@ -87,7 +88,7 @@ impl Threads {
                 Ok(result) => return Some(result),
                 Err(RecvTimeoutError::Disconnected) => return self.panicked().map(Err),
                 Err(RecvTimeoutError::Timeout) if self.stop.is_stopped() => return None,
-                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Timeout) => observe(&self.progress.snapshot()),
             }
             // Simulated time runs ahead of a matcher at work; that is no silence.
             let working = self.clock.is_virtual() && self.progress.is_busy();
@@ -103,6 +104,19 @@ impl Threads {
                 let waited = timeout.unwrap_or_default();
                 return Some(Err(Timeout { waited, missing }.into()));
             }
+        }
+    }
+
+    fn finish(mut self) -> StreamStats {
+        self.end();
+        self.stats()
+    }
+
+    fn end(&mut self) {
+        self.stop.stop();
+        for (_, handle) in self.handles.drain(..) {
+            // A panic has been printed by its thread; there is no one to give it to here.
+            let _ = handle.join();
         }
     }
 
@@ -122,11 +136,7 @@ impl Threads {
 
 impl Drop for Threads {
     fn drop(&mut self) {
-        self.stop.stop();
-        for (_, handle) in self.handles.drain(..) {
-            // A panic has been printed by its thread; there is no one to give it to here.
-            let _ = handle.join();
-        }
+        self.end();
     }
 }
 
@@ -138,7 +148,7 @@ pub struct DepthStream {
     // Dropped first: threads that wait for room notice.
     results: Results<DepthFrame>,
     threads: Threads,
-    seen_pixels: usize,
+    info: MatchInfo,
 }
 
 impl DepthStream {
@@ -148,7 +158,15 @@ impl DepthStream {
     /// [`Error::Timeout`] says what is missing; whatever ends the stream; [`Error::Stopped`] after its
     /// end.
     pub fn next_timeout(&mut self, timeout: Duration) -> Result<DepthFrame, Error> {
-        self.threads.next(&self.results, Some(timeout)).unwrap_or(Err(Error::Stopped))
+        self.threads.next(&self.results, Some(timeout), &mut |_| {}).unwrap_or(Err(Error::Stopped))
+    }
+
+    /// The next depth frame; `observe` is shown the counters every few milliseconds until it is there.
+    pub fn next_observed(
+        &mut self,
+        mut observe: impl FnMut(&StreamStats),
+    ) -> Option<Result<DepthFrame, Error>> {
+        self.threads.next(&self.results, None, &mut observe)
     }
 
     /// Counters since the start.
@@ -161,9 +179,15 @@ impl DepthStream {
         self.threads.stop.clone()
     }
 
-    /// Pixels of the rectified canvas that the left camera sees: what completeness is a part of.
-    pub fn seen_pixels(&self) -> usize {
-        self.seen_pixels
+    /// Stops the stream, waits for its threads and returns the final counters.
+    pub fn finish(self) -> StreamStats {
+        drop(self.results);
+        self.threads.finish()
+    }
+
+    /// How this stream matches.
+    pub fn matching(&self) -> &MatchInfo {
+        &self.info
     }
 }
 
@@ -171,7 +195,7 @@ impl Iterator for DepthStream {
     type Item = Result<DepthFrame, Error>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        self.threads.next(&self.results, None)
+        self.threads.next(&self.results, None, &mut |_| {})
     }
 }
 
@@ -200,8 +224,14 @@ impl PairStream {
         self.threads.stop.clone()
     }
 
+    /// Stops the stream, waits for its threads and returns the final counters.
+    pub fn finish(self) -> StreamStats {
+        drop(self.results);
+        self.threads.finish()
+    }
+
     fn take(&mut self, timeout: Option<Duration>) -> Option<Result<LabelledPair, Error>> {
-        let result = self.threads.next(&self.results, timeout)?;
+        let result = self.threads.next(&self.results, timeout, &mut |_| {})?;
         if result.is_ok() {
             self.threads.progress.mark(super::stats::Mark::Window, self.threads.clock.now_ns());
             self.threads.progress.end_work();
@@ -229,7 +259,6 @@ fn start_pairs(
     source: PairSource,
     options: &StreamOptions,
 ) -> Result<(Threads, Results<LabelledPair>, bool), Error> {
-    let (out, results) = bounded(PAIR_QUEUE);
     let stop = StopHandle::default();
     match source {
         PairSource::Live { session, lease } => {
@@ -238,7 +267,9 @@ fn start_pairs(
             // From here on dropping the capture thread's guard switches the light off.
             let progress = Arc::new(Progress::new(clock.now_ns()));
             let lossless = session.cameras().is_lossless();
-            let (captured, input) = bounded(CAPTURE_QUEUE);
+            let room = |queue| if lossless { LOSSLESS_QUEUE } else { queue };
+            let (captured, input) = bounded(room(CAPTURE_QUEUE));
+            let (out, results) = bounded(room(PAIR_QUEUE));
             let mut threads = Threads {
                 stop: stop.clone(),
                 progress: Arc::clone(&progress),
@@ -254,7 +285,7 @@ fn start_pairs(
             let capture = Capture {
                 session: Arc::clone(&session),
                 progress: Arc::clone(&progress),
-                stop,
+                stop: stop.clone(),
                 timeout: options.timeout,
                 out: captured,
                 generation: started.timing_generation,
@@ -263,11 +294,12 @@ fn start_pairs(
                 session.stop();
                 return Err(error);
             }
-            let pairing = PairThread { input, out, progress, config, lossless };
+            let pairing = PairThread { input, out, progress, stop, config, lossless };
             threads.spawn("pair", move || pairing.run())?;
             Ok((threads, results, lossless))
         }
         PairSource::Replay { recording, clock } => {
+            let (out, results) = bounded(LOSSLESS_QUEUE);
             let progress = Arc::new(Progress::new(clock.now_ns()));
             let mut threads = Threads {
                 stop: stop.clone(),
@@ -307,7 +339,7 @@ pub(crate) fn depth(source: PairSource, options: &StreamOptions) -> Result<Depth
             (engine, Box::new(move |_| Some(cycle.clone())), false)
         }
     };
-    let seen_pixels = engine.seen_pixels();
+    let info = engine.info();
     let (mut threads, input, lossless) = start_pairs(source, options)?;
     let (out, results) = bounded(DEPTH_QUEUE);
     let matching = MatchThread {
@@ -323,5 +355,5 @@ pub(crate) fn depth(source: PairSource, options: &StreamOptions) -> Result<Depth
         live,
     };
     threads.spawn("match", move || matching.run())?;
-    Ok(DepthStream { results, threads, seen_pixels })
+    Ok(DepthStream { results, threads, info })
 }

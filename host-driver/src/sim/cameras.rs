@@ -4,12 +4,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use stspp_hil_sim::world::{Camera, World};
-use stspp_matcher::Image;
 
 use super::Rig;
 use super::options::Pace;
 use super::rig::Exposure;
-use crate::RawImage;
+use crate::accuracy::capture::raw_of;
 use crate::camera::{CameraError, CameraFrame, CameraSource, fingerprint};
 use crate::sync::{FrameStamp, Side};
 
@@ -42,14 +41,7 @@ impl SimCameras {
         let Exposure { open_ns, close_ns, lights, .. } = exposure;
         // The time of the exposure makes its noise its own.
         let rendered = self.world.expose(camera, *open_ns, *close_ns, lights, *open_ns);
-        let bits = rendered.bits;
-        let (width, height) = (rendered.width, rendered.height);
-        let image = match rendered.to_gray8() {
-            Some(data) => Image::from_vec(width, height, data).map(RawImage::gray8),
-            None => Image::from_vec(width, height, rendered.data)
-                .map(|pixels| RawImage::gray16(pixels, bits)),
-        };
-        let image = image.expect("the renderer fills its image");
+        let image = raw_of(rendered);
         let (offset_ns, drift_ppm) = CLOCKS[side.index()];
         let drift_ns = i128::from(*open_ns) * i128::from(drift_ppm) / 1_000_000;
         let stamp = FrameStamp {

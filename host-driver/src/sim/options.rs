@@ -10,6 +10,15 @@ pub const DEFAULT_SCENE: &str = "sphere";
 /// Options of the sensor; a scene has its own besides.
 const KNOWN: &str = "seed, scale, bits, pace, rig, and the scene's own (stspp list --scenes)";
 
+/// Options of the sensor: name, default, what it does.
+pub const SENSOR_OPTIONS: &[(&str, &str, &str)] = &[
+    ("seed", "1", "dot layouts, tolerances and noise; a whole number"),
+    ("scale", "1", "cameras with 1/scale of the pixels in each direction; 1, 2, 4, 8 or 16"),
+    ("bits", "8", "bits of a pixel; 8, 10 or 12"),
+    ("pace", "fast", "fast: time passes as frames are consumed; real: as on the wall"),
+    ("rig", "default", "default, or a whole number for a rig with other optics and poses"),
+];
+
 /// How fast simulated time passes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Pace {

@@ -1,11 +1,22 @@
 //! The `stspp` command line: one file per verb.
 
 mod bench;
-#[allow(dead_code)]
+mod capture;
+mod completions;
+#[cfg(feature = "sim")]
+mod demo;
+#[allow(dead_code, reason = "the table of exit codes is whole, whoever uses it")]
 mod exit;
-#[allow(dead_code)]
+mod frame_report;
+mod info;
+mod interrupt;
+mod list;
 mod output;
 mod reconstruct;
+mod record;
+mod source;
+mod stream;
+mod timing;
 
 use std::process::ExitCode;
 
@@ -29,17 +40,39 @@ struct Cli {
 }
 
 #[derive(Subcommand)]
+#[command(rename_all = "kebab-case")]
 enum Verb {
+    List(list::Args),
+    Info(info::Args),
+    #[cfg(feature = "sim")]
+    Demo(demo::Args),
     Reconstruct(reconstruct::Args),
+    Timing(timing::Args),
+    Stream(stream::Args),
+    Capture(capture::Args),
+    Record(record::Args),
+    Play(stream::PlayArgs),
     Bench(bench::Args),
+    Completions(completions::Args),
 }
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
     let output = Output { json: cli.json, quiet: cli.quiet };
+    interrupt::install();
     let result: Result<(), Failure> = match cli.verb {
+        Verb::List(args) => list::run(&args, &output),
+        Verb::Info(args) => info::run(&args, &output),
+        #[cfg(feature = "sim")]
+        Verb::Demo(args) => demo::run(&args, &output),
         Verb::Reconstruct(args) => reconstruct::run(&args, &output),
+        Verb::Timing(args) => timing::run(&args, &output),
+        Verb::Stream(args) => stream::run(&args, &output),
+        Verb::Capture(args) => capture::run(&args, &output),
+        Verb::Record(args) => record::run(&args, &output),
+        Verb::Play(args) => stream::play(&args, &output),
         Verb::Bench(args) => bench::run(&args, &output),
+        Verb::Completions(args) => completions::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -1,0 +1,108 @@
+//! Opening a source, and what its errors mean for the exit code.
+
+use std::path::{Path, PathBuf};
+
+use stspp::export::folder::OutputError;
+use stspp::{Error, ProjectionTiming, Sensor, StreamOptions, timing};
+
+use crate::exit::{Failure, Kind};
+use crate::reconstruct::Matching;
+
+/// The source of a verb.
+#[derive(clap::Args, Clone)]
+pub struct Source {
+    /// Where frames come from: usb:, usb:SERIAL, serial:PORT, sim:, sim:SCENE?OPTION=VALUE&...,
+    /// replay:FOLDER.
+    #[arg(long = "source", short = 's', default_value = "sim:", value_name = "URI")]
+    pub uri: String,
+    /// Projection timing to set first: a JSON file as `timing get --json` prints it.
+    #[arg(long, value_name = "FILE")]
+    pub timing: Option<PathBuf>,
+}
+
+impl Source {
+    /// Opens it and sets the timing, if one is given.
+    pub fn open(&self) -> Result<Sensor, Failure> {
+        let mut sensor = Sensor::open(&self.uri).map_err(|e| failure(&e))?;
+        if let Some(path) = &self.timing {
+            sensor.set_timing(read_timing(path)?).map_err(|e| failure(&e))?;
+        }
+        Ok(sensor)
+    }
+}
+
+/// Reads a timing from a file, bare or as the `timing` of an object.
+pub fn read_timing(path: &Path) -> Result<ProjectionTiming, Failure> {
+    let wrong = |what: String| Failure::new(Kind::Input, format!("{}: {what}", path.display()));
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    let value: serde_json::Value =
+        serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
+    let bare = value.get("timing").unwrap_or(&value).to_string();
+    timing::from_json(&bare).map_err(|error| wrong(error.to_string()))
+}
+
+/// Stream options of the matching flags.
+pub fn stream_options(matching: &Matching) -> StreamOptions {
+    StreamOptions { matching: matching.options(), ..StreamOptions::default() }
+}
+
+/// The failure that an error of the library is.
+pub fn failure(error: &Error) -> Failure {
+    let kind = match error {
+        Error::Uri(_)
+        | Error::Simulation(_)
+        | Error::Recording(_)
+        | Error::Calibration(_)
+        | Error::Rectify(_)
+        | Error::Match(_)
+        | Error::Timing(_)
+        | Error::NoSpeckleSlot => Kind::Input,
+        Error::Transport(_)
+        | Error::Camera(_)
+        | Error::Timeout(_)
+        | Error::Refused { .. }
+        | Error::Faulted(_)
+        | Error::DeviceReset(_)
+        | Error::NotBuiltIn { .. }
+        | Error::Unsupported { .. }
+        | Error::Streaming => Kind::Sensor,
+        _ => Kind::Other,
+    };
+    let failure = Failure::new(kind, error);
+    match error {
+        Error::Uri(_) => failure.remedy("see `stspp list`"),
+        Error::Simulation(_) => failure.remedy("see `stspp list --scenes`"),
+        Error::Timing(_) => failure.remedy("nothing has changed; `stspp info` shows the limits"),
+        _ => failure,
+    }
+}
+
+/// The failure that an output error is.
+pub fn output_failure(error: &OutputError) -> Failure {
+    crate::reconstruct::output_failure(error)
+}
+
+#[cfg(feature = "sim")]
+impl Source {
+    /// Opens a `sim:` source and keeps its world, for truth.
+    ///
+    /// # Errors
+    /// As [`Source::open`]; for any other source.
+    pub fn open_sim(
+        &self,
+    ) -> Result<(Sensor, std::sync::Arc<stspp_hil_sim::world::World>), Failure> {
+        let uri: stspp::SourceUri = self.uri.parse().map_err(|e| failure(&Error::Uri(e)))?;
+        let stspp::SourceUri::Sim { scene, options } = &uri else {
+            return Err(Failure::new(Kind::Usage, format!("{uri}: expected a sim: source")));
+        };
+        let options =
+            stspp::sim::SimOptions::parse(scene.as_deref(), options).map_err(|e| failure(&e))?;
+        let sim = stspp::sim::SimSensor::new(&options).map_err(|e| failure(&e))?;
+        let world = std::sync::Arc::clone(&sim.world);
+        let mut sensor = Sensor::from_parts(sim.into_parts(uri)).map_err(|e| failure(&e))?;
+        if let Some(path) = &self.timing {
+            sensor.set_timing(read_timing(path)?).map_err(|e| failure(&e))?;
+        }
+        Ok((sensor, world))
+    }
+}
