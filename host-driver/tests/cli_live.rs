@@ -22,9 +22,7 @@ impl Folder {
 
     fn names(&self, folder: &str) -> Vec<String> {
         let mut names: Vec<String> = std::fs::read_dir(self.0.join(folder))
-            .map(|entries| {
-                entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect()
-            })
+            .map(|entries| entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect())
             .unwrap_or_default();
         names.sort();
         names
@@ -76,8 +74,17 @@ fn fails(args: &[&str], code: i32) -> String {
 fn help_lists_the_verbs_and_exit_codes() {
     let help = succeeds(&["--help"]);
     for verb in [
-        "list", "info", "demo", "reconstruct", "timing", "stream", "capture", "record", "play",
-        "bench", "completions",
+        "list",
+        "info",
+        "demo",
+        "reconstruct",
+        "timing",
+        "stream",
+        "capture",
+        "record",
+        "play",
+        "bench",
+        "completions",
     ] {
         assert!(help.lines().any(|l| l.trim_start().starts_with(verb)), "{verb} in\n{help}");
     }
@@ -109,7 +116,13 @@ fn info_shows_versions_state_and_timing() {
 #[test]
 fn timings_are_set_field_by_field() {
     let text = succeeds(&[
-        "timing", "set", "-s", "sim:plane?scale=8", "--slots", "9,8,3+4,flood,dark", "--period-us",
+        "timing",
+        "set",
+        "-s",
+        "sim:plane?scale=8",
+        "--slots",
+        "9,8,3+4,flood,dark",
+        "--period-us",
         "40000",
     ]);
     assert_eq!(
@@ -123,7 +136,16 @@ fn timings_are_set_field_by_field() {
 #[test]
 fn an_impossible_timing_names_each_rule() {
     let error = fails(
-        &["timing", "set", "-s", "sim:plane?scale=8", "--exposure-us", "60000", "--slots", "12,3,4"],
+        &[
+            "timing",
+            "set",
+            "-s",
+            "sim:plane?scale=8",
+            "--exposure-us",
+            "60000",
+            "--slots",
+            "12,3,4",
+        ],
         3,
     );
     for part in [
@@ -139,14 +161,20 @@ fn an_impossible_timing_names_each_rule() {
 #[test]
 fn a_timing_file_goes_from_verb_to_verb() {
     let folder = Folder::new("timing");
-    let set = json(&[
-        "timing", "set", "--json", "-s", "sim:plane?scale=16", "--slots", "7,1,4",
-    ]);
+    let set = json(&["timing", "set", "--json", "-s", "sim:plane?scale=16", "--slots", "7,1,4"]);
     let file = folder.path("timing.json");
     std::fs::write(&file, set.to_string()).unwrap();
     let recording = folder.path("recording");
     succeeds(&[
-        "record", &recording, "-q", "-s", "sim:plane?scale=16", "--timing", &file, "-n", "4",
+        "record",
+        &recording,
+        "-q",
+        "-s",
+        "sim:plane?scale=16",
+        "--timing",
+        &file,
+        "-n",
+        "4",
     ]);
     let frames: serde_json::Value = serde_json::from_str(
         &std::fs::read_to_string(Path::new(&recording).join("frames.json")).unwrap(),
@@ -199,7 +227,8 @@ fn demo_writes_its_outputs_and_compares_with_the_truth() {
     let text = succeeds(&["demo", "-q", "--scene", "sphere?scale=4", "--out", &out]);
     assert!(text.contains("sphere fit RMS") && text.contains("plane fit RMS"), "{text}");
     assert!(text.contains("look at ") && text.contains("depth_color.png"), "{text}");
-    let files = ["cloud.ply", "depth.png", "depth_color.png", "disparity.tiff", "report.json", "zncc.png"];
+    let files =
+        ["cloud.ply", "depth.png", "depth_color.png", "disparity.tiff", "report.json", "zncc.png"];
     assert_eq!(folder.names("out"), files);
     let report = std::fs::read_to_string(Path::new(&out).join("report.json")).unwrap();
     let report: serde_json::Value = serde_json::from_str(&report).unwrap();
@@ -280,7 +309,9 @@ fn ctrl_c_ends_cleanly_and_leaves_nothing_behind() {
         assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
         std::thread::sleep(Duration::from_millis(20));
     }
-    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    assert!(
+        Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success()
+    );
     let output = child.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
     // Whole frames only, and nothing half-written.

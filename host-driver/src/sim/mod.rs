@@ -16,11 +16,10 @@ pub mod rig;
 use std::sync::{Arc, Mutex};
 
 use stspp_hil_sim::device::in_process::{InProcess, InProcessOptions};
-use stspp_hil_sim::world::World;
+use stspp_hil_sim::world::{CameraModel, SensorModel, World};
 
-use crate::accuracy::calibration_of;
 use crate::clock::Clock;
-use crate::{Error, StereoCalibration};
+use crate::{CameraIntrinsics, Error, StereoCalibration};
 
 pub use cameras::SimCameras;
 pub use link::SimLink;
@@ -91,5 +90,22 @@ impl SimSensor {
             clock: self.clock,
             calibration: self.calibration,
         }
+    }
+}
+
+/// The calibration of a sensor model.
+pub fn calibration_of(model: &SensorModel) -> StereoCalibration {
+    let camera = |camera: &CameraModel| CameraIntrinsics {
+        focal_px: camera.focal_px,
+        principal_px: camera.principal_px,
+        radtan: camera.radtan,
+        resolution_px: [camera.width, camera.height],
+    };
+    StereoCalibration {
+        left: camera(&model.left),
+        right: camera(&model.right),
+        right_from_left: model.right_from_left,
+        temperature_c: None,
+        date: None,
     }
 }
