@@ -85,9 +85,9 @@ async fn main(spawner: Spawner) {
 
     let boot: Boot = safety::boot(reset::take_cause());
     defmt::info!(
-        "{=str} up after {} reset, faults carried over: {:#x}",
+        "{=str} up after {} reset, faults carried over: {=u32:#x}",
         embassy_gd32f3x0::chip::NAME,
-        defmt::Debug2Format(&boot.cause),
+        boot.cause,
         boot.carried.0
     );
     let clocks = embassy_gd32f3x0::rcu::clocks();

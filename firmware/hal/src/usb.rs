@@ -53,7 +53,9 @@ impl<'d> Driver<'d> {
         out_buffer: &'d mut [u8],
         config: Config,
     ) -> Self {
+        // Clocked from here on: endpoints may be asked for their state before the bus is polled.
         // The PHY takes PA11 and PA12 over as soon as it is powered.
+        regs::rcu().ahben.modify(|_, w| w.usbfsen().set_bit());
         let instance = OtgInstance {
             regs: otg(),
             state: STATE.as_state(),
@@ -98,7 +100,7 @@ impl<'d> embassy_usb_driver::Driver<'d> for Driver<'d> {
     }
 }
 
-/// The bus: as the inner one, after the core is clocked, reset and powered.
+/// The bus: as the inner one, after the core is reset and powered.
 pub struct Bus<'d> {
     inner: OtgBus<'d>,
     started: bool,
@@ -106,7 +108,6 @@ pub struct Bus<'d> {
 
 impl Bus<'_> {
     fn start(&mut self) {
-        regs::rcu().ahben.modify(|_, w| w.usbfsen().set_bit());
         regs::rcu().ahbrst.modify(|_, w| w.usbfsrst().set_bit());
         regs::rcu().ahbrst.modify(|_, w| w.usbfsrst().clear_bit());
         self.inner.core_soft_reset();
