@@ -9,6 +9,7 @@
 mod elf;
 mod toolchain;
 
+use crate::stage::{self, Outcome};
 use crate::{licences, workspace};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -64,11 +65,22 @@ pub fn run(arguments: &[&str]) -> Result<String, String> {
     if boards.is_empty() {
         boards.extend(BOARDS);
     }
-    let toolchain = toolchain::find(install)?;
+    build_all(&toolchain::find(install)?, &boards)
+}
+
+/// Both boards as a stage of the test command: skipped only where no compiler can be had.
+pub fn stage() -> Outcome {
+    match toolchain::find(true) {
+        Err(why) => Outcome::Skipped(why),
+        Ok(toolchain) => stage::check(build_all(&toolchain, &BOARDS)),
+    }
+}
+
+fn build_all(toolchain: &Toolchain, boards: &[&str]) -> Result<String, String> {
     println!("{toolchain}");
     let mut report = String::new();
-    for board in boards {
-        let image = build(&toolchain, board)?;
+    for &board in boards {
+        let image = build(toolchain, board)?;
         report += &describe(board, &image);
         within_budget(board, &image).map_err(|over| format!("{report}{over}"))?;
     }

@@ -2,7 +2,7 @@
 //! one failed, so that one run shows all that is wrong.
 
 use crate::stage::{self, Outcome, Stage};
-use crate::{arrows, debian, licences, workspace};
+use crate::{arrows, debian, firmware, licences, workspace};
 use std::process::{Command, ExitCode};
 
 /// How much to test.
@@ -48,6 +48,12 @@ pub fn run(depth: Depth) -> ExitCode {
         }),
         stage::run("memory of the kernels", || {
             deeper(depth, &["valgrind"], || Outcome::Skipped("not written yet".into()))
+        }),
+        stage::run("firmware arithmetic", || stage::check(firmware::run(&["--test"]))),
+        // Before the tests: those of the emulated chip run its ELFs.
+        stage::run("firmware", || match depth {
+            Depth::Quick => Outcome::Skipped("left out by --quick".into()),
+            Depth::Full => firmware::stage(),
         }),
         stage::run("tests", || {
             stage::command(cargo(&["test", "--locked", "--workspace", "--no-fail-fast"]))

@@ -24,6 +24,7 @@ pub fn sizes(bytes: &[u8]) -> Result<(u64, u64), String> {
     let (mut flash, mut ram) = (0, 0);
     for index in 0..count {
         let at = table + index * entry_size;
+        bytes.get(at..at + entry_size).ok_or("cut short")?;
         if word(bytes, at, 4)? != PT_LOAD {
             continue;
         }
