@@ -22,7 +22,7 @@ pub mod parallel;
 pub mod params;
 pub mod pipeline;
 pub mod regions;
-mod retry;
+pub mod retry;
 pub mod search;
 pub mod stack;
 pub mod synthetic;

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use crate::{
     Error, Image, Level, Matched, Method, Params, StageTime, StereoStack,
-    census::PaddedStack,
+    census::{PaddedStack, Side},
     check,
     fast::Fast,
     icgn::{field::Field, guess::CoarseMap, prepare::Prepared},
@@ -87,8 +87,8 @@ impl Matcher {
 
     /// The coarse search and its checks.
     fn coarse(&mut self, stack: &StereoStack<'_>, clock: &mut Clock) -> Coarse {
-        self.left.fill(stack.left, stack.left_mask);
-        self.right.fill(stack.right, stack.right_mask);
+        self.left.fill(Side::Left, stack.left, stack.left_mask);
+        self.right.fill(Side::Right, stack.right, stack.right_mask);
         clock.stage("pad");
         let mut coarse = search::search(&self.left, &self.right, &self.params, self.level);
         clock.stage("search");

@@ -12,6 +12,10 @@ use crate::{
     wta,
 };
 
+/// Least similarity of a match by the larger window. Of some hundred unrelated candidates the best is
+/// at 0.6 to 0.7 by chance; a match is above 0.75 even in noise of a tenth of the dots' height.
+pub const SIMILARITY_MIN: f32 = 0.7;
+
 /// Rows and lines that a task needs, reused from row to row.
 #[derive(Debug, Default)]
 pub(crate) struct Scratch {
@@ -37,13 +41,16 @@ pub(crate) fn retry_row(
     let radius = params.advanced.retry_radius;
     left_row.fill(left, y, radius, census);
     right_row.fill(right, y, radius, census);
-    let margin = params.advanced.uniqueness * left_row.bits() as f32;
+    let margin = params.advanced.uniqueness * left_row.bits_inside() as f32;
     for &x in again {
         line.fill(left_row, x, right_row, candidates(x, params), kernel);
         let Some(winner) = wta::winner(line, kernel).filter(|w| w.is_unique(margin)) else {
             continue;
         };
-        let point = point(x, line, winner, left_row.bits());
+        let point = point(x, line, winner, left_row.bits_inside());
+        if point.similarity < SIMILARITY_MIN {
+            continue;
+        }
         // The right pixel's own best partner: left columns of the same disparities.
         let range = params.disparity;
         let column = winner.column as i64;

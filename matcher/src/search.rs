@@ -100,10 +100,11 @@ fn search_row(
         let columns = line.first()..line.first() + line.costs().len();
         let (cost, at) = (&mut best_cost[columns.clone()], &mut best_x[columns]);
         kernel.keep_best(line.costs(), x as u16, cost, at);
-        found[x] = wta::winner(line, kernel).map(|w| (point(x, line, w, left_row.bits()), w));
+        found[x] =
+            wta::winner(line, kernel).map(|w| (point(x, line, w, left_row.bits_inside()), w));
     }
     again.clear();
-    let margin = params.advanced.uniqueness * left_row.bits() as f32;
+    let margin = params.advanced.uniqueness * left_row.bits_inside() as f32;
     for (x, &found) in found.iter().enumerate() {
         let Some((point, winner)) = found else { continue };
         let back = best_x[winner.column] as f32 - winner.column as f32;

@@ -7,7 +7,7 @@ use reference::{Volume, census, check, icgn, parabola, wta};
 use stspp_matcher::{
     DisparityRange, Image, Interpolation, Level, Params, Sample, StereoStack,
     bspline::{self, LANES},
-    census::{CensusKernel, CensusRow, PaddedStack},
+    census::{CensusKernel, CensusRow, PaddedStack, Side, outside_bit},
     check as fast_check,
     icgn::{
         Refiner,
@@ -60,10 +60,15 @@ fn volume(images: &[Image<Sample>], mask: Option<&Image<u8>>) -> Volume {
         .collect()
 }
 
-fn padded(images: &[Image<Sample>], mask: Option<&Image<u8>>) -> PaddedStack {
+fn padded(side: Side, images: &[Image<Sample>], mask: Option<&Image<u8>>) -> PaddedStack {
     let mut stack = PaddedStack::default();
-    stack.fill(&images.iter().collect::<Vec<_>>(), mask);
+    stack.fill(side, &images.iter().collect::<Vec<_>>(), mask);
     stack
+}
+
+/// Bits of samples outside: none in rows outside the image, elsewhere those documented.
+fn outside(side: Side) -> impl Fn(usize, i64, i64) -> bool {
+    move |t, x, y| (0..25).contains(&y) && outside_bit(side, t, x as isize, y as usize)
 }
 
 #[test]
@@ -72,13 +77,18 @@ fn census_bits_follow_equations_1_to_3() {
         let rendered = small_scene(frames);
         let mask = mask(3);
         let expected = volume(&rendered.left, Some(&mask));
-        let stack = padded(&rendered.left, Some(&mask));
+        let stack = padded(Side::Left, &rendered.left, Some(&mask));
         for level in Level::available() {
             let mut row = CensusRow::default();
             for y in [0, 1, 12, 24] {
                 row.fill(&stack, y, radius, CensusKernel::new(level));
                 for x in 0..61 {
-                    let bits = census::census(&expected, x as i64, y as i64, radius as i64);
+                    let bits = census::census(
+                        &expected,
+                        (x as i64, y as i64),
+                        radius as i64,
+                        &outside(Side::Left),
+                    );
                     assert_eq!(row.invalid()[x] == 0, bits.is_some());
                     for (k, bit) in bits.into_iter().flatten().enumerate() {
                         assert_eq!(row.bit(x, k), bit, "{level} ({x}, {y}) bit {k}");
@@ -90,28 +100,32 @@ fn census_bits_follow_equations_1_to_3() {
 }
 
 /// The whole search, candidate by candidate.
+#[allow(clippy::needless_range_loop)]
 fn reference_search(left: &Volume, right: &Volume, params: &Params) -> Vec<Vec<f64>> {
     let (h, w) = (left[0].len(), left[0][0].len());
     let a = &params.advanced;
     let (dmin, dmax) = (params.disparity.min_px as i64, params.disparity.max_px as i64);
-    let descriptors = |v: &Volume, y: usize, radius: usize| -> Vec<Option<Vec<bool>>> {
-        (0..w as i64).map(|x| census::census(v, x, y as i64, radius as i64)).collect()
+    let descriptors = |v: &Volume, side: Side, y: usize, radius: usize| {
+        let outside = outside(side);
+        let at = |x: i64| census::census(v, (x, y as i64), radius as i64, &outside);
+        (0..w as i64).map(at).collect::<Vec<_>>()
     };
     let mut out = vec![vec![f64::NAN; w]; h];
     for y in 0..h {
         for x in 0..w {
             for (attempt, radius) in [a.census_radius, a.retry_radius].into_iter().enumerate() {
-                let l = descriptors(left, y, radius);
-                let r = descriptors(right, y, radius);
+                let l = descriptors(left, Side::Left, y, radius);
+                let r = descriptors(right, Side::Right, y, radius);
+                let rows = (y + radius + 1).min(h) - y.saturating_sub(radius);
+                let bits = (rows * (2 * radius + 1) * left.len()) as f64;
                 let cost = |x: i64, d: i64| {
                     let l = l.get(usize::try_from(x).ok()?)?.as_ref()?;
-                    census::cost(l, r.get(usize::try_from(x - d).ok()?)?.as_ref())
+                    census::cost(l, r.get(usize::try_from(x - d).ok()?)?.as_ref(), bits)
                 };
                 let costs: Vec<_> = (dmin..=dmax).map(|d| (d, cost(x as i64, d))).collect();
                 let Some((d, least)) = wta::winner(&costs) else { break };
                 let at = |d: i64| if d < dmin || d > dmax { None } else { cost(x as i64, d) };
                 let subpixel = parabola::subpixel(d, at(d - 1), least, at(d + 1));
-                let bits = ((2 * radius + 1).pow(2) * left.len()) as f64;
                 let margin =
                     (a.uniqueness as f64).max(stspp_matcher::wta::MARGIN_MIN as f64 / bits);
                 let unique =
@@ -123,7 +137,8 @@ fn reference_search(left: &Volume, right: &Volume, params: &Params) -> Vec<Vec<f
                     .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))
                     .expect("the left pixel is one");
                 let consistent = (back.1 as f64 - subpixel).abs() <= a.left_right_px as f64;
-                let reliable = attempt == 1 || 1.0 - least > a.retry_similarity as f64;
+                let floor = [a.retry_similarity, stspp_matcher::retry::SIMILARITY_MIN][attempt];
+                let reliable = 1.0 - least > floor as f64;
                 if unique && consistent && reliable {
                     out[y][x] = subpixel;
                     break;
@@ -146,8 +161,8 @@ fn search_finds_what_brute_force_in_f64_finds() {
             &volume(&rendered.right, Some(&right_mask)),
             &params,
         );
-        let left = padded(&rendered.left, Some(&left_mask));
-        let right = padded(&rendered.right, Some(&right_mask));
+        let left = padded(Side::Left, &rendered.left, Some(&left_mask));
+        let right = padded(Side::Right, &rendered.right, Some(&right_mask));
         for level in Level::available() {
             let found = search::search(&left, &right, &params, level).disparity_px;
             let mut matched = 0;

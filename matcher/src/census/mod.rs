@@ -13,9 +13,29 @@ pub use kernel::CensusKernel;
 /// Columns a SIMD block covers; row strides are multiples of it.
 pub const BLOCK: usize = 32;
 
-/// Value of a sample that is outside the image or its mask. No mean is below it, so that it never
-/// sets a bit.
-const OUTSIDE: Sample = Sample::MIN;
+/// The left or the right camera.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Side {
+    /// Left.
+    #[default]
+    Left,
+    /// Right.
+    Right,
+}
+
+/// Values of samples that are outside the image or its mask. No threshold is below the one or above
+/// the other: the bit of the first is always 0, of the second always 1.
+const OUTSIDE: [Sample; 2] = [Sample::MIN, Sample::MAX];
+
+/// Bit of a sample that is outside its mask, or left or right of the image.
+pub fn outside_bit(side: Side, t: usize, x: isize, y: usize) -> bool {
+    let place =
+        ((side as u64) << 60) ^ ((t as u64) << 40) ^ ((y as u64) << 20) ^ (x as u64 & 0xfffff);
+    // The middle bits of a product with an odd constant depend on all lower bits of the factor.
+    let mixed = (place ^ (place >> 29)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let mixed = (mixed ^ (mixed >> 32)).wrapping_mul(0xd6e8_feb8_6659_fd93);
+    mixed >> 40 & 1 != 0
+}
 
 /// Rounds a width up to whole blocks.
 pub fn stride_of(width: usize) -> usize {
@@ -39,9 +59,14 @@ pub struct PaddedStack {
     outside: Vec<Sample>,
 }
 
+/// What a missing sample is stored as.
+fn outside_sample(side: Side, t: usize, x: isize, y: usize) -> Sample {
+    OUTSIDE[outside_bit(side, t, x, y) as usize]
+}
+
 impl PaddedStack {
-    /// Copies `frames`, all of one size, reusing this stack's memory.
-    pub fn fill(&mut self, frames: &[&Image<Sample>], mask: Option<&Image<u8>>) {
+    /// Copies one side's `frames`, all of one size, reusing this stack's memory.
+    pub fn fill(&mut self, side: Side, frames: &[&Image<Sample>], mask: Option<&Image<u8>>) {
         use rayon::prelude::*;
 
         (self.width, self.height) = (frames[0].width(), frames[0].height());
@@ -49,8 +74,8 @@ impl PaddedStack {
         self.pitch = stride_of(self.width) + 2 * RADIUS_LIMIT;
         let (width, pitch, n) = (self.width, self.pitch, self.frames);
         self.outside.clear();
-        self.outside.resize(pitch, OUTSIDE);
-        self.samples.resize(self.height * n * pitch, OUTSIDE);
+        self.outside.resize(pitch, OUTSIDE[0]);
+        self.samples.resize(self.height * n * pitch, 0);
         self.sums.resize(self.height * width, 0);
         self.inside.resize(self.height * width, 0);
         self.samples
@@ -66,15 +91,22 @@ impl PaddedStack {
                     None => inside.fill(1),
                 }
                 sums.fill(0);
-                for (row, frame) in rows.chunks_exact_mut(pitch).zip(frames) {
-                    row[..RADIUS_LIMIT].fill(OUTSIDE);
-                    row[RADIUS_LIMIT + width..].fill(OUTSIDE);
-                    let row = &mut row[RADIUS_LIMIT..][..width];
+                for (t, (row, frame)) in rows.chunks_exact_mut(pitch).zip(frames).enumerate() {
+                    let outside =
+                        |at: usize| outside_sample(side, t, at as isize - RADIUS_LIMIT as isize, y);
+                    // Beyond the margin there are only pixels that are invalid themselves.
+                    for at in
+                        (0..RADIUS_LIMIT).chain(RADIUS_LIMIT + width..2 * RADIUS_LIMIT + width)
+                    {
+                        row[at] = outside(at);
+                    }
+                    row[2 * RADIUS_LIMIT + width..].fill(OUTSIDE[0]);
                     for x in 0..width {
-                        // The lowest value is the mark of the outside; nothing is lost by raising
-                        // a sample by one part in 32768 off it.
-                        let v = frame.row(y)[x].max(OUTSIDE + 1);
-                        row[x] = if inside[x] != 0 { v } else { OUTSIDE };
+                        // The extremes mark the outside; nothing is lost by moving a sample by one
+                        // part in 32768 off them.
+                        let v = frame.row(y)[x].clamp(OUTSIDE[0] + 1, OUTSIDE[1] - 1);
+                        let at = RADIUS_LIMIT + x;
+                        row[at] = if inside[x] != 0 { v } else { outside(at) };
                         sums[x] += if inside[x] != 0 { v as i32 } else { 0 };
                     }
                 }
@@ -119,6 +151,7 @@ pub struct CensusRow {
     width: usize,
     stride: usize,
     bits: usize,
+    bits_inside: usize,
     planes: Vec<u16>,
     /// 0 at pixels inside the mask, all ones elsewhere and in the padding.
     invalid: Vec<u16>,
@@ -138,6 +171,8 @@ impl CensusRow {
         self.width = stack.width;
         self.stride = stride_of(stack.width);
         self.bits = side * side * stack.frames;
+        let rows = (y + radius + 1).min(stack.height) - y.saturating_sub(radius);
+        self.bits_inside = rows * side * stack.frames;
         self.planes.resize(self.bits.div_ceil(16) * self.stride, 0);
         self.invalid.clear();
         self.invalid.resize(self.stride, u16::MAX);
@@ -201,6 +236,11 @@ impl CensusRow {
     /// Bits of a descriptor: N (2R+1)^2.
     pub fn bits(&self) -> usize {
         self.bits
+    }
+
+    /// Bits in rows inside the image: the others agree always.
+    pub fn bits_inside(&self) -> usize {
+        self.bits_inside
     }
 
     /// All planes, one after the other.
