@@ -305,7 +305,7 @@ fn printed_edges_appear_where_geometry_says() {
         let p = rig.rotation * in_rig + rig.translation.vector;
         let [u, v] = project(&camera, &p);
         let row = v.round();
-        if row < 2.0 || row > 197.0 || !(20.0..380.0).contains(&u) {
+        if !(2.0..=197.0).contains(&row) || !(20.0..380.0).contains(&u) {
             continue;
         }
         // The edge's place in this row: along its slope in the image.

@@ -83,11 +83,15 @@ pub(crate) struct CameraUnit {
     /// Vignetting times pixel sensitivity.
     sensitivity: Vec<f32>,
     noise_seed: u64,
-    still: Mutex<Still>,
+    kept: Mutex<Kept>,
 }
 
+/// What later exposures use again.
 #[derive(Default)]
-struct Still {
+struct Kept {
+    /// Of a moving scene's view.
+    directions: Option<Arc<Vec<[f32; 2]>>>,
+    /// Of a still scene.
     gbuffer: Option<Arc<GBuffer>>,
     images: BTreeMap<Origin, RateImage>,
 }
@@ -130,7 +134,7 @@ impl CameraUnit {
             response: Response::new(model.blur_sigma_px),
             sensitivity,
             noise_seed: key(seed, 0xf4a),
-            still: Mutex::default(),
+            kept: Mutex::default(),
         }
     }
 
@@ -207,19 +211,26 @@ impl CameraUnit {
     }
 
     fn look(&self, scene: &Scene, time_ns: u64) -> GBuffer {
-        GBuffer::new(&self.view(), &scene.at(time_ns))
+        let view = self.view();
+        let known = self.lock().directions.clone();
+        let directions = known.unwrap_or_else(|| Arc::new(view.directions()));
+        if !scene.is_still() {
+            // Every frame needs them again.
+            self.lock().directions.get_or_insert_with(|| Arc::clone(&directions));
+        }
+        GBuffer::new(&view, &directions, &scene.at(time_ns))
     }
 
     /// The image of a still scene, made when first asked for. Nothing is computed under the lock: a
     /// worker that waits for its share could be handed another exposure of this camera meanwhile.
     fn still_image(&self, scene: &Scene, lights: &Lights, origin: Origin) -> RateImage {
-        let known = |still: &Still| still.images.get(&origin).cloned();
+        let known = |kept: &Kept| kept.images.get(&origin).cloned();
         let gbuffer = {
-            let still = self.lock();
-            if let Some(image) = known(&still) {
+            let kept = self.lock();
+            if let Some(image) = known(&kept) {
                 return image;
             }
-            still.gbuffer.clone()
+            kept.gbuffer.clone()
         };
         let gbuffer = gbuffer.unwrap_or_else(|| {
             let gbuffer = Arc::new(self.look(scene, 0));
@@ -229,9 +240,9 @@ impl CameraUnit {
         self.lock().images.entry(origin).or_insert(image).clone()
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, Still> {
+    fn lock(&self) -> std::sync::MutexGuard<'_, Kept> {
         // A panic elsewhere cannot leave the cache half-written: entries are added whole.
-        self.still.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+        self.kept.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
     fn image(

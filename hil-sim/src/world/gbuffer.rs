@@ -43,6 +43,22 @@ impl View<'_> {
         (cell - self.margin as f64 + 0.5) / CELLS_PER_PIXEL as f64 - 0.5
     }
 
+    /// Normalised coordinates (x/z, y/z) of the ray through each cell's centre. In single precision:
+    /// that moves a ray by less than 0.0001 px.
+    pub fn directions(&self) -> Vec<[f32; 2]> {
+        let columns = self.columns();
+        let mut directions = vec![[0.0_f32; 2]; columns * self.rows()];
+        directions.par_chunks_mut(columns).enumerate().for_each(|(row, line)| {
+            let v = self.pixel(row as f64);
+            let mut near = self.camera.unproject([self.pixel(0.0), v]);
+            for (column, direction) in line.iter_mut().enumerate() {
+                near = self.camera.unproject_from([self.pixel(column as f64), v], near);
+                *direction = near.map(|c| c as f32);
+            }
+        });
+        directions
+    }
+
     fn ray(&self, normalised: [f64; 2]) -> Ray {
         let direction = Vector3::new(normalised[0], normalised[1], 1.0).normalize();
         Ray {
@@ -98,21 +114,20 @@ impl Sample {
 
     /// Whether the surface between two neighbouring samples is one smooth piece.
     fn continues_to(&self, other: &Self) -> bool {
-        if self.object != other.object {
+        if self.object != other.object || self.albedo.abs_diff(other.albedo) >= 2000 {
             return false;
         }
         if !self.is_surface() {
             return true;
         }
-        let step = other.point() - self.point();
-        let (n, m) = (self.normal(), other.normal());
-        let length = step.norm();
+        let step = [0, 1, 2].map(|k| other.point[k] - self.point[k]);
+        let [n, m] = [self, other].map(|s| s.normal.map(|v| f32::from(v) * (1.0 / 32767.0)));
+        let dot = |a: &[f32; 3], b: &[f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
         // A smooth surface stays near the tangent planes, even one seen at 80 degrees (where
         // neighbours are six cells' widths apart); a step leaves both.
-        let rise = step.dot(&n).abs().min(step.dot(&m).abs());
-        rise <= 0.35 * length + 1e-6
-            && n.dot(&m) > 0.75
-            && self.albedo.abs_diff(other.albedo) < 2000
+        let rise = dot(&step, &n).abs().min(dot(&step, &m).abs());
+        let allowed2 = 0.1225 * dot(&step, &step) + 1e-12;
+        rise * rise <= allowed2 && dot(&n, &m) > 0.75
     }
 }
 
@@ -127,33 +142,39 @@ pub(crate) struct GBuffer {
 }
 
 impl GBuffer {
-    pub fn new(view: &View<'_>, scene: &PosedScene<'_>) -> Self {
+    /// Looks along `directions`, which are the view's own.
+    pub fn new(view: &View<'_>, directions: &[[f32; 2]], scene: &PosedScene<'_>) -> Self {
         let (columns, rows) = (view.columns(), view.rows());
         let mut cells = vec![Sample::NOTHING; columns * rows];
-        cells.par_chunks_mut(columns).enumerate().for_each(|(row, line)| {
-            let v = view.pixel(row as f64);
-            let mut near = view.camera.unproject([view.pixel(0.0), v]);
-            for (column, cell) in line.iter_mut().enumerate() {
-                let pixel = [view.pixel(column as f64), v];
-                near = view.camera.unproject_from(pixel, near);
-                *cell = look(scene, &view.ray(near));
-            }
-        });
-        let refined: Vec<u32> = (0..rows)
+        cells.par_chunks_mut(columns).zip(directions.par_chunks(columns)).for_each(
+            |(line, directions)| {
+                for (cell, direction) in line.iter_mut().zip(directions) {
+                    *cell = look(scene, &view.ray(direction.map(f64::from)));
+                }
+            },
+        );
+        // Which cells do not continue to the right (1) or down (2): both sides are edges.
+        let breaks: Vec<u8> = (0..rows)
             .into_par_iter()
             .flat_map_iter(|row| {
                 let cells = &cells;
-                (0..columns).filter_map(move |column| {
-                    let index = row * columns + column;
-                    let continues = |other: usize| cells[index].continues_to(&cells[other]);
-                    let is_smooth = (column == 0 || continues(index - 1))
-                        && (column + 1 == columns || continues(index + 1))
-                        && (row == 0 || continues(index - columns))
-                        && (row + 1 == rows || continues(index + columns));
-                    (!is_smooth).then_some(index as u32)
+                (0..columns).map(move |column| {
+                    let cell = &cells[row * columns + column];
+                    let right = column + 1 < columns
+                        && !cell.continues_to(&cells[row * columns + column + 1]);
+                    let down =
+                        row + 1 < rows && !cell.continues_to(&cells[(row + 1) * columns + column]);
+                    u8::from(right) | u8::from(down) << 1
                 })
             })
             .collect();
+        let is_edge = |index: usize| {
+            breaks[index] != 0
+                || (!index.is_multiple_of(columns) && breaks[index - 1] & 1 != 0)
+                || (index >= columns && breaks[index - columns] & 2 != 0)
+        };
+        let refined: Vec<u32> =
+            (0..cells.len()).filter(|&index| is_edge(index)).map(|index| index as u32).collect();
         for &index in &refined {
             cells[index as usize].is_edge = true;
         }
@@ -181,8 +202,10 @@ fn look(scene: &PosedScene<'_>, ray: &Ray) -> Sample {
     let albedo = scene.albedo(object, &point).clamp(0.0, 1.0);
     Sample {
         point: [point.x as f32, point.y as f32, point.z as f32],
-        normal: [hit.normal.x, hit.normal.y, hit.normal.z].map(|v| (v * 32767.0).round() as i16),
-        albedo: (albedo * 65535.0).round() as u16,
+        // Rounding by truncation of positive numbers: a library call would take as long as the ray.
+        normal: [hit.normal.x, hit.normal.y, hit.normal.z]
+            .map(|v| ((v * 32767.0 + 32768.5) as i32 - 32768) as i16),
+        albedo: (albedo * 65535.0 + 0.5) as u16,
         object: object as u16,
         is_edge: false,
     }
