@@ -293,6 +293,30 @@ fn completions_are_printed() {
 
 #[cfg(unix)]
 #[test]
+fn ctrl_c_during_a_reconstruction_removes_what_was_begun() {
+    let folder = Folder::new("interrupt-reconstruct");
+    let recording = folder.path("recording");
+    succeeds(&["record", &recording, "-q", "-s", "sim:plane?scale=2"]);
+    let child = Command::new(env!("CARGO_BIN_EXE_stspp"))
+        .args(["reconstruct", &recording, "-q", "--out", &folder.path("new/out")])
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let begun = Instant::now();
+    while folder.names("new").is_empty() {
+        assert!(begun.elapsed() < Duration::from_secs(60), "not begun");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert!(
+        Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success()
+    );
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
+    assert_eq!(folder.names("."), ["recording"], "nothing but the input");
+}
+
+#[cfg(unix)]
+#[test]
 fn ctrl_c_ends_cleanly_and_leaves_nothing_behind() {
     let folder = Folder::new("interrupt");
     let out = folder.path("out");

@@ -3,6 +3,38 @@
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Stages that are being filled: what an interrupted program has to remove.
+static UNFINISHED: Mutex<Vec<Unfinished>> = Mutex::new(Vec::new());
+
+#[derive(Debug)]
+struct Unfinished {
+    stage: PathBuf,
+    made: Vec<PathBuf>,
+}
+
+impl Unfinished {
+    fn remove(&self) {
+        // Failures here come after one that is reported already.
+        let _ = fs::remove_dir_all(&self.stage);
+        for path in &self.made {
+            let _ = fs::remove_dir(path);
+        }
+    }
+}
+
+fn unfinished() -> MutexGuard<'static, Vec<Unfinished>> {
+    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Removes what all unfinished outputs of this process have written so far: for a program that is about
+/// to end without unwinding. An output that is just being moved into place is waited for.
+pub fn discard_unfinished() {
+    for output in unfinished().drain(..) {
+        output.remove();
+    }
+}
 
 /// Why an output could not be written. Nothing of it is left behind.
 #[derive(Debug, thiserror::Error)]
@@ -80,7 +112,10 @@ impl OutputFolder {
             let leaf = target.file_name().unwrap_or_default().to_string_lossy().into_owned();
             folder.stage = target.with_file_name(format!(".{leaf}{name}"));
         }
+        let mut unfinished = unfinished();
         fs::create_dir(&folder.stage).map_err(failed(&folder.stage))?;
+        unfinished.push(Unfinished { stage: folder.stage.clone(), made: folder.made.clone() });
+        drop(unfinished);
         Ok(folder)
     }
 
@@ -133,6 +168,7 @@ impl OutputFolder {
             let path = path.to_owned();
             move |source| OutputError::Write { path, source }
         };
+        let mut unfinished = unfinished();
         if self.target_existed {
             for name in &self.files {
                 let to = self.target.join(name);
@@ -145,6 +181,7 @@ impl OutputFolder {
         } else {
             fs::rename(&self.stage, &self.target).map_err(failed(&self.target))?;
         }
+        unfinished.retain(|output| output.stage != self.stage);
         self.committed = true;
         Ok(())
     }
@@ -155,10 +192,7 @@ impl Drop for OutputFolder {
         if self.committed {
             return;
         }
-        // Failures here come after one that is reported already.
-        let _ = fs::remove_dir_all(&self.stage);
-        for path in &self.made {
-            let _ = fs::remove_dir(path);
-        }
+        unfinished().retain(|output| output.stage != self.stage);
+        Unfinished { stage: self.stage.clone(), made: self.made.clone() }.remove();
     }
 }

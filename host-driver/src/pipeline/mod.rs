@@ -2,9 +2,9 @@
 //!
 //! ```text
 //!  control link ─┐
-//!                ├─► capture ──► pair ──► match ──► publish ──► DepthStream
-//!  cameras ──────┘                │        (rectify newest,
-//!  recording ────────► replay ────┘         window, match)
+//!                ├─► capture ──► pair ──► match ──► DepthStream
+//!  cameras ──────┘                │        (rectify the newest, window,
+//!  recording ────────► replay ────┤         match, reproject, publish)
 //!                                 └──► PairStream
 //! ```
 //!
