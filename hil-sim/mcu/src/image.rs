@@ -110,6 +110,16 @@ impl Image {
         Ok(Self { flash, flash_bytes, static_ram_bytes, symbols, elf })
     }
 
+    /// An image from the flash's first words, without symbols: small programs for tests.
+    #[must_use]
+    pub fn from_words(words: &[u32]) -> Self {
+        let mut flash = vec![0xff; FLASH_BYTES as usize];
+        for (bytes, word) in flash.chunks_exact_mut(4).zip(words) {
+            bytes.copy_from_slice(&word.to_le_bytes());
+        }
+        Self { elf: Vec::new(), flash, flash_bytes: 4 * words.len() as u32, static_ram_bytes: 0, symbols: HashMap::new() }
+    }
+
     /// Address of a symbol.
     #[must_use]
     pub fn symbol(&self, name: &str) -> Option<u32> {

@@ -9,12 +9,16 @@
 //! ([`chip::Chip::unmodelled`]): a test that ends with an empty list has met the chip's manual, not
 //! an emulator's guess.
 
+pub mod board;
 pub mod chip;
 pub mod clock;
+pub mod controller;
 pub mod cpu;
 #[cfg(feature = "defmt-log")]
 pub mod defmt_log;
 pub mod image;
 pub mod rtt;
+pub mod session;
 pub mod soc;
+pub mod trace;
 pub mod usb;
