@@ -8,7 +8,7 @@ use crate::soc::pins::Pin;
 
 /// Thermistor at the projectors: 10 kOhm at 25 degrees, to ground, under a 10 kOhm pull-up.
 const NTC_OHM_25: f64 = 10_000.0;
-const NTC_BETA_K: f64 = 3_950.0;
+const NTC_BETA_K: f64 = 3_435.0;
 const NTC_PULL_UP_OHM: f64 = 10_000.0;
 
 /// A board.
@@ -53,10 +53,10 @@ const COMMON: Board = Board {
     floodlight: pin(1, 10),
     camera_triggers: [pin(1, 12), pin(1, 13)],
     interlock: pin(0, 0),
-    interlock_closed_level: false,
-    trigger_in: pin(0, 1),
+    interlock_closed_level: true,
+    trigger_in: pin(0, 4),
     led: pin(2, 13),
-    thermistor_channel: 4,
+    thermistor_channel: 1,
 };
 
 impl Board {

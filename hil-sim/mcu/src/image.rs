@@ -117,7 +117,13 @@ impl Image {
         for (bytes, word) in flash.chunks_exact_mut(4).zip(words) {
             bytes.copy_from_slice(&word.to_le_bytes());
         }
-        Self { elf: Vec::new(), flash, flash_bytes: 4 * words.len() as u32, static_ram_bytes: 0, symbols: HashMap::new() }
+        Self {
+            elf: Vec::new(),
+            flash,
+            flash_bytes: 4 * words.len() as u32,
+            static_ram_bytes: 0,
+            symbols: HashMap::new(),
+        }
     }
 
     /// Address of a symbol.

@@ -80,7 +80,13 @@ fn a_register_without_a_model_is_named() {
     let mut chip = Chip::new(Variant::F330, &image);
     chip.run_until_ns(100_000);
     let names: Vec<String> = chip.unmodelled().into_iter().map(|entry| entry.what).collect();
-    assert_eq!(names, ["RCU.CFG0 field CKOUTSEL written: not modelled", "TIMER5.CTL0 accessed: no model of that peripheral"]);
+    assert_eq!(
+        names,
+        [
+            "RCU.CFG0 field CKOUTSEL written: not modelled",
+            "TIMER5.CTL0 accessed: no model of that peripheral"
+        ]
+    );
 }
 
 #[test]

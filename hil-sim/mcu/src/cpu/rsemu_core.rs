@@ -5,7 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rsemu::core::BusError;
 use rsemu::core::space::{
-    AddressSpace, MemAttrs, MemOps, MemResult, Perms, RamStore, Region, UnassignedPolicy,
+    AddressSpace, DispatchPolicy, MemAttrs, MemOps, MemResult, Perms, RamStore, Region,
+    UnassignedPolicy,
 };
 use rsemu::core::value::{Endian, Width};
 use rsemu::cpu::arm::v7m::{ArmV7m, Config};
@@ -87,6 +88,9 @@ pub struct RsemuCpu {
     irqs: u128,
 }
 
+/// Look-up of addresses by 16 KiB pages up to the USB core.
+const PAGES: DispatchPolicy = DispatchPolicy::Dense { page_bits: 14, cover: 0x5004_0000 };
+
 /// Where the flash lies, and where it appears a second time for the reset vectors.
 const FLASH_BASES: [u64; 2] = [0x0800_0000, 0];
 const RAM_BASE: u64 = 0x2000_0000;
@@ -100,7 +104,9 @@ impl RsemuCpu {
         ram: Arc<RamStore>,
         bus: &Arc<Mutex<B>>,
     ) -> Self {
-        let space = AddressSpace::new("core", 32).with_unassigned(UnassignedPolicy::FAULT);
+        let space = AddressSpace::new("core", 32)
+            .with_unassigned(UnassignedPolicy::FAULT)
+            .with_dispatch(PAGES);
         let flash_bytes = flash.len();
         {
             let mut map = space.topology();
