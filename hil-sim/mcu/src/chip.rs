@@ -14,6 +14,8 @@ use crate::soc::{FLASH_BYTES, RAM_BYTES, Shared, Soc, Variant};
 
 /// Cycles that the reset pin stays low before the core starts (datasheet: about 20 us at 8 MHz).
 const RESET_CYCLES: u64 = 160;
+/// What [`Chip::paint_stack`] writes.
+const PAINT: u32 = 0xa5c3_5a3c;
 /// How often the loop looks whether the core sleeps, in one-cycle steps.
 const IDLE_CHECK_STEPS: u32 = 4;
 
@@ -349,6 +351,33 @@ impl Chip {
     /// The program goes astray: the core continues at `address`.
     pub fn jump_to(&mut self, address: u32) {
         self.cpu.set_pc(address & !1);
+    }
+
+    /// The program calls the function at `address` with `argument`, which is not expected to return.
+    pub fn call(&mut self, address: u32, argument: u32) {
+        self.cpu.set_register(0, argument);
+        self.cpu.set_pc(address & !1);
+    }
+
+    /// Fills the unused part of the stack with a pattern, for [`Chip::stack_used`].
+    pub fn paint_stack(&mut self, image: &Image) {
+        let top = self.cpu.registers()[13].min(RAM_BASE + RAM_BYTES);
+        let mut address = image.stack_limit();
+        // The words just below the stack pointer may be in use by an exception entry.
+        while address + 64 < top {
+            self.poke(address, PAINT);
+            address += 4;
+        }
+    }
+
+    /// Bytes of stack that were ever used since [`Chip::paint_stack`].
+    #[must_use]
+    pub fn stack_used(&self, image: &Image) -> u32 {
+        let mut address = image.stack_limit();
+        while address < RAM_BASE + RAM_BYTES && self.peek(address) == PAINT {
+            address += 4;
+        }
+        RAM_BASE + RAM_BYTES - address
     }
 
     /// The supply fails: pins float, a flash operation in progress is torn.

@@ -132,6 +132,37 @@ impl Image {
         self.symbols.get(name).copied()
     }
 
+    /// Lowest address that the stack may reach: the end of the static RAM.
+    #[must_use]
+    pub fn stack_limit(&self) -> u32 {
+        ["__euninit", "__ebss"]
+            .iter()
+            .find_map(|name| self.symbol(name))
+            .unwrap_or(RAM_BASE + self.static_ram_bytes)
+            .next_multiple_of(4)
+    }
+
+    /// Address of a `core::panic::Location` in the flash: a reference to a source file's name, its
+    /// length, line and column. Panic functions take one as their argument.
+    #[must_use]
+    pub fn any_panic_location(&self) -> Option<u32> {
+        let word = |offset: usize| {
+            let bytes = self.flash.get(offset..offset + 4)?;
+            Some(u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]))
+        };
+        (0..self.flash.len()).step_by(4).find_map(|offset| {
+            let (name, length) =
+                (word(offset)?.checked_sub(FLASH_BASE)? as usize, word(offset + 4)? as usize);
+            let (line, column) = (word(offset + 8)?, word(offset + 12)?);
+            let sound = (4..200).contains(&length)
+                && (1..20_000).contains(&line)
+                && (1..400).contains(&column);
+            let path = if sound { self.flash.get(name..name + length)? } else { return None };
+            let trimmed = path.strip_suffix(b"\0").unwrap_or(path);
+            trimmed.ends_with(b".rs").then_some(FLASH_BASE + offset as u32)
+        })
+    }
+
     /// Address of the function whose name contains all of `parts` (mangled names keep their parts).
     #[must_use]
     pub fn symbol_containing(&self, parts: &[&str]) -> Option<u32> {

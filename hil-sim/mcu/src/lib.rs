@@ -17,6 +17,7 @@ pub mod cpu;
 #[cfg(feature = "defmt-log")]
 pub mod defmt_log;
 pub mod image;
+pub mod measure;
 pub mod rtt;
 pub mod session;
 pub mod soc;

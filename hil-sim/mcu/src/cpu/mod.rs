@@ -68,6 +68,9 @@ pub trait Cpu: Send {
     /// Moves the program counter (fault injection).
     fn set_pc(&mut self, pc: u32);
 
+    /// Writes one of r0 to r12 (fault injection).
+    fn set_register(&mut self, index: u8, value: u32);
+
     /// Registers r0 to r15 and xPSR, for reports.
     fn registers(&self) -> [u32; 17];
 }

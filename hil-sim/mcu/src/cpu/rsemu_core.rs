@@ -208,6 +208,10 @@ impl Cpu for RsemuCpu {
         self.core.set_pc(pc);
     }
 
+    fn set_register(&mut self, index: u8, value: u32) {
+        self.core.set_reg(index.min(12), value);
+    }
+
     fn registers(&self) -> [u32; 17] {
         let regs = self.core.regs();
         let mut all = [0; 17];

@@ -159,7 +159,10 @@ impl Peripheral for Adc {
                 self.stat &= value;
                 self.raise(cx);
             }
-            0x04 => self.ctl[0] = value,
+            0x04 => {
+                self.ctl[0] = value;
+                self.raise(cx);
+            }
             0x08 => {
                 let was_on = self.ctl[1] & ADCON != 0;
                 // Calibration takes 83 ADC clocks (user manual 11.4.1); its reset is immediate.

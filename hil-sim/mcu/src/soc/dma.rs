@@ -50,6 +50,8 @@ pub struct Dma {
     levels: Vec<DmaSource>,
     remap: u32,
     in_flight: Option<(Transfer, u64)>,
+    /// A transfer is being made; its count is not up to date yet.
+    transferring: bool,
 }
 
 impl Dma {
@@ -130,7 +132,7 @@ impl Dma {
     }
 
     fn arbitrate(&mut self, now: u64) {
-        if self.in_flight.is_some() {
+        if self.in_flight.is_some() || self.transferring {
             return;
         }
         // Higher PRIO first, then the lower channel number.
@@ -162,11 +164,14 @@ impl Dma {
     /// is made even when its channel was switched off meanwhile (the worst case for a firmware that
     /// wants its outputs off).
     pub fn take_transfer(&mut self) -> Option<Transfer> {
-        self.in_flight.take().map(|(transfer, _)| transfer)
+        let (transfer, _) = self.in_flight.take()?;
+        self.transferring = true;
+        Some(transfer)
     }
 
     /// Accounts for the transfer that the chip has made (or that ended in a bus error).
     pub fn complete(&mut self, transfer: Transfer, failed: bool, cx: &mut Cx<'_>) {
+        self.transferring = false;
         let n = usize::from(transfer.channel);
         let channel = &mut self.channels[n];
         let shift = 4 * n;
