@@ -348,6 +348,24 @@ impl Chip {
         self.stop = Stop::Hung;
     }
 
+    /// Sets a timer's counter, as if so much time had passed (the firmware is not asked).
+    pub fn advance_timer(&mut self, timer: crate::soc::peripheral::TimerId, count: u32) {
+        self.act(|soc, cx| {
+            use crate::soc::peripheral::Peripheral;
+            soc.timers[timer.index()].write(0x24, count, cx);
+        });
+    }
+
+    /// Lets time pass until the core executes (at most 100 ms): a sleeping core cannot go astray.
+    pub fn run_until_awake(&mut self) {
+        for _ in 0..100_000 {
+            if !self.cpu.is_idle() {
+                return;
+            }
+            self.run_for_ns(1_000);
+        }
+    }
+
     /// The program goes astray: the core continues at `address`.
     pub fn jump_to(&mut self, address: u32) {
         self.cpu.set_pc(address & !1);
@@ -361,7 +379,10 @@ impl Chip {
 
     /// Fills the unused part of the stack with a pattern, for [`Chip::stack_used`].
     pub fn paint_stack(&mut self, image: &Image) {
-        let top = self.cpu.registers()[13].min(RAM_BASE + RAM_BYTES);
+        let end = RAM_BASE + RAM_BYTES;
+        // Before the first instruction the stack pointer is not loaded yet.
+        let top =
+            Some(self.cpu.registers()[13]).filter(|sp| (RAM_BASE..end).contains(sp)).unwrap_or(end);
         let mut address = image.stack_limit();
         // The words just below the stack pointer may be in use by an exception entry.
         while address + 64 < top {

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use stspp_hil_sim::device::{Controller, PinEdge};
+use stspp_hil_sim::device::{Controller, Line, PinEdge};
 use stspp_protocol::usb;
 
 use crate::board::{Board, thermistor_volts};
@@ -66,6 +66,8 @@ pub struct McuController {
     usb: Option<UsbLink>,
     to_host: Vec<u8>,
     changes: Vec<PinChange>,
+    /// Lines that are high.
+    high: Vec<Line>,
     link_connected: bool,
 }
 
@@ -92,6 +94,7 @@ impl McuController {
             usb,
             to_host: Vec::new(),
             changes: Vec::new(),
+            high: Vec::new(),
             link_connected: true,
         };
         controller.set_interlock_closed(true);
@@ -131,6 +134,12 @@ impl McuController {
     pub fn take_pin_changes(&mut self) -> Vec<PinChange> {
         self.collect_changes();
         std::mem::take(&mut self.changes)
+    }
+
+    /// Lines that are high, as far as the edges handed out say.
+    #[must_use]
+    pub fn high_lines(&self) -> &[Line] {
+        &self.high
     }
 
     /// Whether any light is on.
@@ -298,6 +307,12 @@ impl Controller for McuController {
                 Some(line) => {
                     // A floating gate is off: its pull-down holds it.
                     let high = change.level == Level::High;
+                    let position = self.high.iter().position(|l| *l == line);
+                    match (high, position) {
+                        (true, None) => self.high.push(line),
+                        (false, Some(position)) => drop(self.high.swap_remove(position)),
+                        _ => continue,
+                    }
                     edges.push(PinEdge { time_ns: change.time_ns, line, high });
                 }
                 None => kept.push(change),

@@ -125,7 +125,8 @@ impl Cause {
             (Cause::DebugHalt, _) => &[FaultReason::DebugHalt, FaultReason::Watchdog],
             (Cause::OverTemperature, _) => &[FaultReason::OverTemperature],
             (Cause::SensorOpen, _) => &[FaultReason::TemperatureSensor],
-            (Cause::OnTime, _) => &[FaultReason::OnTime],
+            // Whoever notices first: the guard, or the engine whose edge did not come.
+            (Cause::OnTime, _) => &[FaultReason::OnTime, FaultReason::Engine],
             (Cause::BrownOut | Cause::ResetPin, _) => &[],
         }
     }
@@ -235,10 +236,15 @@ pub fn measure(session: &mut Session<McuController>, cause: Cause) -> Result<Out
     while !session.controller.light_is_on() {
         session.run_for(200_000);
     }
-    // A millisecond into the slot's light.
+    // Well into the slot's light.
     session.run_for(1_000_000);
+    if matches!(cause, Cause::Panic | Cause::HardFault) {
+        session.controller.chip().run_until_awake();
+        session.run_for(1);
+    }
     session.take_edges();
     let start_ns = session.controller.now_ns();
+    let lit = session.controller.high_lines().to_vec();
     cause.apply(session);
     let watch_ns = 2 * cause.bound_ns(variant).max(300_000_000);
     let end_ns = start_ns + watch_ns;
@@ -250,7 +256,7 @@ pub fn measure(session: &mut Session<McuController>, cause: Cause) -> Result<Out
         }
     }
     let edges = session.take_edges();
-    let fell_ns = last_fall_ns(&edges, is_light);
+    let fell_ns = last_fall_ns(&edges, lit, is_light);
     let dark_after_ns = if session.controller.light_is_on() {
         None
     } else {

@@ -57,18 +57,21 @@ pub fn grid_deviation_ns(times: &[u64], period_ns: u64) -> u64 {
         .unwrap_or(0)
 }
 
-/// The time after which all lines of `wanted` were low for good, and whether they ever were high.
+/// The time of the last fall among the lines of `wanted`; `None` where one is still high. Lines in
+/// `high` are high before the first edge.
 #[must_use]
-pub fn last_fall_ns(edges: &[PinEdge], wanted: impl Fn(Line) -> bool) -> Option<u64> {
-    let mut high: Vec<Line> = Vec::new();
+pub fn last_fall_ns(
+    edges: &[PinEdge],
+    mut high: Vec<Line>,
+    wanted: impl Fn(Line) -> bool,
+) -> Option<u64> {
+    high.retain(|line| wanted(*line));
     let mut last = None;
     for edge in edges.iter().filter(|edge| wanted(edge.line)) {
         if edge.high {
-            if !high.contains(&edge.line) {
-                high.push(edge.line);
-            }
-        } else {
-            high.retain(|line| *line != edge.line);
+            high.push(edge.line);
+        } else if let Some(position) = high.iter().position(|line| *line == edge.line) {
+            high.swap_remove(position);
             last = Some(edge.time_ns);
         }
     }

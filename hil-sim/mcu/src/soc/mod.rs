@@ -90,17 +90,24 @@ pub struct Soc {
     pub(crate) gpio: [Gpio; 6],
     pub(crate) exti: Exti,
     pub(crate) syscfg: Syscfg,
-    pub(crate) dma: Dma,
-    pub(crate) timers: [Timer; 7],
-    pub(crate) usarts: [Usart; 2],
-    pub(crate) adc: Adc,
-    pub(crate) fmc: Fmc,
-    pub(crate) fwdgt: Fwdgt,
+    /// DMA controller.
+    pub dma: Dma,
+    /// Timers, by [`TimerId::index`].
+    pub timers: [Timer; 7],
+    /// USARTs.
+    pub usarts: [Usart; 2],
+    /// Converter and the voltages at its inputs.
+    pub adc: Adc,
+    /// Flash controller.
+    pub fmc: Fmc,
+    /// Watchdog.
+    pub fwdgt: Fwdgt,
     pub(crate) pmu: Pmu,
     pub(crate) ctc: Ctc,
     pub(crate) crc: Crc,
     pub(crate) dbg: Dbg,
-    pub(crate) usbfs: Usbfs,
+    /// USB core and its host.
+    pub usbfs: Usbfs,
     irq_levels: u128,
     timer_outputs: [[Option<bool>; 7]; 7],
     pin_levels: [[Level; 16]; 6],
