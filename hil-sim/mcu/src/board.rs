@@ -54,9 +54,9 @@ const COMMON: Board = Board {
     camera_triggers: [pin(1, 12), pin(1, 13)],
     interlock: pin(0, 0),
     interlock_closed_level: true,
-    trigger_in: pin(0, 4),
+    trigger_in: pin(0, 1),
     led: pin(2, 13),
-    thermistor_channel: 1,
+    thermistor_channel: 4,
 };
 
 impl Board {

@@ -16,6 +16,9 @@ use stspp_protocol::timing::{ProjectionTiming, Slot};
 /// One tick of the gate timer.
 const TICK_NS: u64 = 1_000;
 
+/// What a DMA transfer for the link can delay an edge by.
+const BUS_NS: u64 = 100;
+
 /// 1 ms slots with the light switched off for 10 us between two of them.
 fn fast() -> ProjectionTiming {
     ProjectionTiming {
@@ -81,13 +84,13 @@ fn check_slots(gates: &[Pulse], triggers: &[Pulse], timing: &ProjectionTiming) {
     let (lead_ns, exposure_ns) =
         (u64::from(timing.gate_lead_us) * 1_000, u64::from(timing.exposure_us) * 1_000);
     for (gate, trigger) in gates.iter().zip(triggers) {
-        // Exact to the cycle: both edges are made by the same chain.
+        // Both edges are made by the same chain: only another DMA transfer can come between.
         assert!(
-            (trigger.rise_ns - gate.rise_ns).abs_diff(lead_ns) <= 20,
+            (trigger.rise_ns - gate.rise_ns).abs_diff(lead_ns) <= BUS_NS,
             "trigger {} ns after the gate",
             trigger.rise_ns - gate.rise_ns
         );
-        assert!((trigger.fall_ns - trigger.rise_ns).abs_diff(exposure_ns) <= 20);
+        assert!((trigger.fall_ns - trigger.rise_ns).abs_diff(exposure_ns) <= BUS_NS);
     }
 }
 
@@ -117,18 +120,6 @@ fn ten_thousand_slots_under_flood(variant: Variant) {
     let resets = session.controller.chip().resets().to_vec();
     assert_eq!(resets.len(), 1, "{variant:?}: {resets:?}, log {:#?}", common::log(&mut session));
     let (gates, triggers) = gates_and_triggers(&mut session);
-    if gates.len() < 10_000 {
-        let status = session.call(Request::GetStatus(GetStatus));
-        let last = gates.last();
-        println!(
-            "{status:?}, bad frames {}, last gate {last:?}, now {}",
-            session.bad_frames,
-            session.controller.now_ns()
-        );
-        println!("log {:?}", common::log(&mut session));
-        let soc = session.controller.chip().soc();
-        println!("{:?} {:?}", soc.usarts[0], soc.dma);
-    }
     println!("{variant:?}: {answered} requests answered");
     let events = session.take_events();
     let faults: Vec<_> =

@@ -9,7 +9,7 @@ use rsemu::core::space::{
     UnassignedPolicy,
 };
 use rsemu::core::value::{Endian, Width};
-use rsemu::cpu::arm::v7m::{ArmV7m, Config};
+use rsemu::cpu::arm::v7m::{ArmV7m, Config, xpsr};
 
 use super::{Bus, BusFault, Cpu, SharedMemory};
 
@@ -143,13 +143,40 @@ impl RsemuCpu {
     }
 }
 
+impl RsemuCpu {
+    /// rsemu 0.0.7 drops ITSTATE from the xPSR that exception entry stacks (the architecture keeps
+    /// it: DDI 0403E B1.5.6), so what was left of an interrupted IT block would run unconditionally
+    /// after the return. Where an interrupt came before the instruction at `pc` of an IT block, the
+    /// frame gets the bits back.
+    fn restore_it_state(&self, before: u32, pc: u32) {
+        let now = self.core.xpsr();
+        if now & xpsr::EXCEPTION == before & xpsr::EXCEPTION {
+            return;
+        }
+        let frame = u64::from(self.core.reg(13));
+        let read = |at: u64| self.space.read(at, Width::U32, MemAttrs::DEBUG).unwrap_or(0) as u32;
+        if read(frame + 24) == pc {
+            let stacked = read(frame + 28) | before & xpsr::IT_MASK;
+            // The frame was just written there; it is RAM.
+            let _ = self.space.write(frame + 28, Width::U32, u64::from(stacked), MemAttrs::DEBUG);
+        }
+    }
+}
+
 fn window<B: Bus + 'static>(base: u32, bus: &Arc<Mutex<B>>) -> Arc<dyn MemOps> {
     Arc::new(Window { base, bus: Arc::clone(bus) })
 }
 
 impl Cpu for RsemuCpu {
     fn step(&mut self) -> u64 {
-        self.core.step()
+        let before = self.core.xpsr();
+        if before & xpsr::IT_MASK == 0 {
+            return self.core.step();
+        }
+        let pc = self.core.pc();
+        let cycles = self.core.step();
+        self.restore_it_state(before, pc);
+        cycles
     }
 
     fn set_irq(&mut self, irq: u16, high: bool) {

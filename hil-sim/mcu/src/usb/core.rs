@@ -456,8 +456,9 @@ impl DeviceCore {
             0x000 => 0x000f_0800,
             0x004 => u32::MAX,
             0x008 => 1,
-            // Turn-around and time-out calibration do not matter here; bit 6 (PHY select) is fixed.
-            0x00c => 0x4000_3c47,
+            // Turn-around and time-out calibration do not matter here, nor HNP and SRP on a device; bits
+            // 6 and 7 are the fixed PHY.
+            0x00c => 0x4000_3fc7,
             0x010 => 0x8000_0ff3,
             0x014 => u32::MAX,
             0x018 => 0xc00c_3c3c,
