@@ -25,7 +25,7 @@ fn program(code: &[u16], literals: &[u32]) -> Image {
 
 /// `ldr rN, [literal]` at `address` for literal `index`.
 fn load(register: u16, address: u16, index: u16) -> u16 {
-    0x4800 | register << 8 | (0x80 + 4 * index - ((address + 4) & !3)) / 4
+    0x4800 | register << 8 | ((0x80 + 4 * index - ((address + 4) & !3)) / 4)
 }
 
 /// Toggles PB0 for ever: set, clear, branch back.
