@@ -2,7 +2,7 @@
 //! one failed, so that one run shows all that is wrong.
 
 use crate::stage::{self, Outcome, Stage};
-use crate::{arrows, debian, firmware, licences, workspace};
+use crate::{arrows, firmware, licences, workspace};
 use std::process::{Command, ExitCode};
 
 /// How much to test.
@@ -46,9 +46,6 @@ pub fn run(depth: Depth) -> ExitCode {
             doc.env("RUSTDOCFLAGS", "-D warnings");
             stage::command(doc)
         }),
-        stage::run("memory of the kernels", || {
-            deeper(depth, &["valgrind"], || Outcome::Skipped("not written yet".into()))
-        }),
         stage::run("firmware arithmetic", || stage::check(firmware::run(&["--test"]))),
         // Before the tests: those of the emulated chip run its ELFs.
         stage::run("firmware", || match depth {
@@ -60,17 +57,6 @@ pub fn run(depth: Depth) -> ExitCode {
         }),
     ];
     summarise(&stages)
-}
-
-/// Skips `work` in a quick run and where its Debian packages cannot be had.
-fn deeper(depth: Depth, packages: &[&str], work: impl FnOnce() -> Outcome) -> Outcome {
-    if depth == Depth::Quick {
-        return Outcome::Skipped("left out by --quick".into());
-    }
-    match debian::ensure(packages) {
-        Ok(()) => work(),
-        Err(why) => Outcome::Skipped(why),
-    }
 }
 
 fn summarise(stages: &[Stage]) -> ExitCode {
