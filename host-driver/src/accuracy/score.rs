@@ -75,13 +75,15 @@ pub fn score(frame: &DepthFrame, truth: &CanvasTruth) -> Score {
 }
 
 /// Valid points of an object within 5 mm of the truth, whose surroundings of `margin` pixels belong
-/// to the object and are seen by both cameras too: points that no depth step disturbs.
+/// to the object and are seen by both cameras too (no depth step disturbs them), and that neither camera
+/// sees at a more grazing angle than `incidence_max_deg`.
 pub fn object_points(
     frame: &DepthFrame,
     truth: &CanvasTruth,
     world: &World,
     object: &str,
     margin: usize,
+    incidence_max_deg: f32,
 ) -> Vec<Point3<f64>> {
     let (width, height) = (truth.object.width(), truth.object.height());
     let of_object = |index: u8| index != 0 && world.object_name(usize::from(index) - 1) == object;
@@ -97,7 +99,8 @@ pub fn object_points(
     for y in 0..height {
         for x in 0..width {
             let (z, true_z) = (frame.depth_m.row(y)[x], truth.depth_m.row(y)[x]);
-            if inside.row(y)[x] && (z - true_z).abs() <= OUTLIER_M {
+            let steep = truth.incidence_deg.row(y)[x] > incidence_max_deg;
+            if inside.row(y)[x] && !steep && (z - true_z).abs() <= OUTLIER_M {
                 let d = f64::from(frame.disparity_px.row(y)[x]);
                 points.extend(frame.geometry.point_left_m(x as f64, y as f64, d));
             }
@@ -173,8 +176,9 @@ pub fn sphere_rms_mm(
     world: &World,
     radius_m: f64,
     margin: usize,
+    incidence_max_deg: f32,
 ) -> Result<(f64, f64), FitError> {
-    let points = object_points(frame, truth, world, "sphere", margin);
+    let points = object_points(frame, truth, world, "sphere", margin, incidence_max_deg);
     let fit = sphere::fit(&points)?;
     Ok((fit.rms_m * 1e3, (fit.radius_m - radius_m) * 1e3))
 }

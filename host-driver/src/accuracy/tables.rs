@@ -15,6 +15,10 @@ const SPHERE_RADIUS_M: f64 = 0.075;
 /// Pixels around a fitted point that belong to the same surface: half a 9x9 subset and one more.
 const MARGIN_PX: usize = 5;
 
+/// Incidence up to which the sphere's "core" is fitted: beyond, a camera sees the surface foreshortened
+/// to less than half, and a square subset is no longer small on it.
+const CORE_DEG: f32 = 60.0;
+
 /// Why a table could not be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -64,6 +68,10 @@ pub struct Line {
     pub fit_rms_mm: Option<f64>,
     /// Error of the fitted sphere's radius in millimetres.
     pub radius_error_mm: Option<f64>,
+    /// The sphere's fit RMS over points that neither camera sees at more than 60 degrees.
+    pub core_rms_mm: Option<f64>,
+    /// Error of that fit's radius in millimetres.
+    pub core_radius_error_mm: Option<f64>,
     /// Against the truth.
     pub score: Score,
     /// Part of the raw pixels at full scale.
@@ -135,21 +143,26 @@ impl Case {
         let frame = self.stack.depth_frame(&mut matcher, 0..frames)?;
         let match_wall_ms = start.elapsed().as_secs_f64() * 1e3;
         let (world, truth) = (&self.capture.world, &self.truth);
-        let (fit_rms_mm, radius_error_mm) = if scene.starts_with("sphere") {
-            sphere_rms_mm(&frame, truth, world, SPHERE_RADIUS_M, MARGIN_PX)
-                .map_or((None, None), |(rms, radius)| (Some(rms), Some(radius)))
-        } else if scene.contains("plane") {
-            (central_plane_rms_mm(&frame, truth).ok(), None)
-        } else {
-            (None, None)
+        let sphere = |incidence_max_deg| {
+            let fit =
+                sphere_rms_mm(&frame, truth, world, SPHERE_RADIUS_M, MARGIN_PX, incidence_max_deg);
+            fit.map_or((None, None), |(rms, radius)| (Some(rms), Some(radius)))
         };
+        let (mut fit, mut core) = ((None, None), (None, None));
+        if scene.starts_with("sphere") {
+            (fit, core) = (sphere(90.0), sphere(CORE_DEG));
+        } else if scene.contains("plane") {
+            fit.0 = central_plane_rms_mm(&frame, truth).ok();
+        }
         let line = Line {
             scene: scene.to_owned(),
             frames,
             method: format!("{:?}", setting.method),
             shape_function: format!("{:?}", setting.shape),
-            fit_rms_mm,
-            radius_error_mm,
+            fit_rms_mm: fit.0,
+            radius_error_mm: fit.1,
+            core_rms_mm: core.0,
+            core_radius_error_mm: core.1,
             score: score(&frame, truth),
             saturated: self.saturated,
             match_wall_ms,
@@ -176,20 +189,22 @@ pub fn to_text(lines: &[Line]) -> String {
         "match"
     );
     text += &format!(
-        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>7} {:>8}\n",
-        "", "", "", "", "mm", "mm", "", "%", "%", "mm", "mm", "%", "ms"
+        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>7} {:>8}\n",
+        "", "", "", "", "mm", "mm", "mm", "mm", "", "%", "%", "mm", "mm", "%", "ms"
     );
     let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.4}"));
     for line in lines {
         let score = &line.score;
         text += &format!(
-            "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9.3} {:>9.4} {:>9.4} {:>9.4} {:>7.3} {:>8.0}\n",
+            "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>9} {:>9} {:>8} {:>9.3} {:>9.4} {:>9.4} {:>9.4} {:>7.3} {:>8.0}\n",
             line.scene,
             line.frames,
             line.method,
             line.shape_function,
             number(line.fit_rms_mm),
             number(line.radius_error_mm),
+            number(line.core_rms_mm),
+            number(line.core_radius_error_mm),
             score.points,
             100.0 * score.completeness,
             100.0 * score.outliers,

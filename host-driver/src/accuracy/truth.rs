@@ -16,9 +16,15 @@ pub struct CanvasTruth {
     pub distance_m: Image<f32>,
     /// Index of the object plus one, 0 where there is none.
     pub object: Image<u8>,
+    /// Angle between the surface's normal and the direction to the camera that sees it at the more
+    /// grazing angle, in degrees; NaN where there is nothing.
+    pub incidence_deg: Image<f32>,
     /// Non-zero where the right camera sees the same surface.
     pub visible_to_both: Image<u8>,
 }
+
+/// Depth, distance, incidence, object and visibility of a pixel.
+type Pixel = (f32, f32, f32, u8, u8);
 
 impl CanvasTruth {
     /// Traces the rays of all pixels that the left camera saw (`left_mask`).
@@ -30,10 +36,11 @@ impl CanvasTruth {
     ) -> Self {
         let truth = world.truth();
         let (width, height) = (geometry.width, geometry.height);
-        let rows: Vec<Vec<(f32, f32, u8, u8)>> = (0..height)
+        let right_centre_left_m = world.model().right_from_left.inverse().translation.vector;
+        let rows: Vec<Vec<Pixel>> = (0..height)
             .into_par_iter()
             .map(|y| {
-                let nothing = (f32::NAN, f32::NAN, 0, 0);
+                let nothing = (f32::NAN, f32::NAN, f32::NAN, 0, 0);
                 let pixel = |x: usize| {
                     if left_mask.get(x, y) == Some(0) {
                         return nothing;
@@ -48,9 +55,15 @@ impl CanvasTruth {
                         return nothing;
                     };
                     let both = truth.visible_from(Camera::Right, &surface.point_left_m, time_ns);
+                    let towards = |centre_left_m: Vector3<f64>| {
+                        let direction = (centre_left_m - surface.point_left_m).normalize();
+                        direction.dot(&surface.normal_left).clamp(-1.0, 1.0)
+                    };
+                    let cosine = towards(Vector3::zeros()).min(towards(right_centre_left_m));
                     (
                         surface.point_left_m.z as f32,
                         surface.distance_m as f32,
+                        cosine.acos().to_degrees() as f32,
                         u8::try_from(surface.object + 1).unwrap_or(u8::MAX),
                         u8::from(both),
                     )
@@ -69,8 +82,9 @@ impl CanvasTruth {
         Self {
             depth_m: image(flat().map(|p| p.0).collect()),
             distance_m: image(flat().map(|p| p.1).collect()),
-            object: bytes(flat().map(|p| p.2).collect()),
-            visible_to_both: bytes(flat().map(|p| p.3).collect()),
+            incidence_deg: image(flat().map(|p| p.2).collect()),
+            object: bytes(flat().map(|p| p.3).collect()),
+            visible_to_both: bytes(flat().map(|p| p.4).collect()),
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Rectification of toed-in, distorted cameras onto canvases with corresponding rows.
 
 mod canvas;
+mod dot;
 mod kernel;
 mod warp;
 

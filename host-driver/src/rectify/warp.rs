@@ -11,6 +11,7 @@ use nalgebra::{Rotation3, Vector2, Vector3};
 use rayon::prelude::*;
 use stspp_matcher::{Image, Sample};
 
+use super::dot;
 use super::kernel::{PHASE_BITS, TAPS, TAPS_BEFORE, fixed_point};
 use crate::raw::RawPixels;
 use crate::{CameraIntrinsics, RawImage};
@@ -154,9 +155,7 @@ impl Warp {
             let along = &self.along_rows[band * BAND * raw_h..];
             for (column, x_of_row) in columns.chunks_mut(padded_h).zip(along.chunks(raw_h)) {
                 let inner = &mut column[TAPS_BEFORE..TAPS_BEFORE + raw_h];
-                for ((out, &at), row) in inner.iter_mut().zip(x_of_row).zip(padded.chunks(stride)) {
-                    *out = interpolate(row, at, taps, shift);
-                }
+                interpolate_all(&padded, stride, x_of_row, taps, shift, inner);
                 let (first, last) = (column[TAPS_BEFORE], column[TAPS_BEFORE + raw_h - 1]);
                 column[..TAPS_BEFORE].fill(first);
                 column[TAPS_BEFORE + raw_h..].fill(last);
@@ -170,26 +169,34 @@ impl Warp {
         out.as_mut_slice().par_chunks_mut(w * BAND).enumerate().for_each(|(band, rows)| {
             let along = &self.along_columns[band * BAND * w..];
             for (row, y_of_u) in rows.chunks_mut(w).zip(along.chunks(w)) {
-                for ((out, &at), column) in row.iter_mut().zip(y_of_u).zip(between.chunks(padded_h))
-                {
-                    *out = interpolate(column, at, &self.taps, TAP_BITS);
-                }
+                interpolate_all(between, padded_h, y_of_u, &self.taps, TAP_BITS, row);
             }
         });
     }
 }
 
-/// One rectified value: 8 taps from `line` at fixed-point position `at`.
-#[inline(always)]
-fn interpolate(line: &[i16], at: Position, taps: &[[i16; TAPS]], shift: u32) -> i16 {
-    let first = (at >> PHASE_BITS) as usize;
-    let phase = (at & ((1 << PHASE_BITS) - 1)) as usize;
-    let (taps, samples) = (&taps[phase], &line[first..first + TAPS]);
-    let mut sum = 1_i32 << (shift - 1);
-    for k in 0..TAPS {
-        sum += i32::from(samples[k]) * i32::from(taps[k]);
+/// Value k of `out` from line k of `lines` (each `stride` long) at position k.
+fn interpolate_all(
+    lines: &[i16],
+    stride: usize,
+    positions: &[Position],
+    taps: &[[i16; TAPS]],
+    shift: u32,
+    out: &mut [i16],
+) {
+    let at = |k: usize| {
+        let first = k * stride + (positions[k] >> PHASE_BITS) as usize;
+        let phase = (positions[k] & ((1 << PHASE_BITS) - 1)) as usize;
+        let samples = lines[first..].first_chunk().expect("lines are padded by the taps");
+        (samples, &taps[phase])
+    };
+    let (fours, rest) = out.as_chunks_mut::<4>();
+    for (k, four) in fours.iter_mut().enumerate() {
+        *four = dot::four([at(4 * k), at(4 * k + 1), at(4 * k + 2), at(4 * k + 3)], shift);
     }
-    (sum >> shift).clamp(i32::from(i16::MIN), i32::from(i16::MAX)) as i16
+    for (k, out) in rest.iter_mut().enumerate() {
+        *out = dot::one(at(4 * fours.len() + k), shift);
+    }
 }
 
 /// Raw rows as padded i16 lines.

@@ -124,7 +124,7 @@ fn residuals(
         {
             continue;
         }
-        let points = score::object_points(frame, truth, world, object, MARGIN_PX);
+        let points = score::object_points(frame, truth, world, object, MARGIN_PX, 90.0);
         if points.len() < POINTS_MIN {
             continue;
         }

@@ -10,6 +10,7 @@ use stspp::{Recording, reconstruct, report};
 use stspp_matcher::{Method, ShapeFunction};
 
 use crate::exit::{Failure, Kind};
+use crate::interrupt;
 use crate::output::Output;
 
 /// Compute depth image and point cloud of a recording folder.
@@ -140,11 +141,13 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let result =
         reconstruct::reconstruct(&recording, &options, &mut |what| progress.set_message(what))
             .map_err(|e| reconstruct_failure(&e))?;
+    interrupt::check()?;
     let source = args.folder.display().to_string();
     let report = report::of_reconstruction(&source, &result);
     outputs::write(&mut out, &result.frame, &report, &mut |file| progress.set_message(file))
-        .and_then(|()| out.commit())
         .map_err(|e| output_failure(&e))?;
+    interrupt::check()?;
+    out.commit().map_err(|e| output_failure(&e))?;
     progress.finish_and_clear();
     let summary = report::Summary::of(&result.frame, result.seen_pixels);
     let total_ms: f64 = result.steps.iter().map(|step| step.wall_ms).sum();

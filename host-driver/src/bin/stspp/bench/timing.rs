@@ -3,13 +3,11 @@
 use std::path::PathBuf;
 
 use serde_json::json;
-use stspp::accuracy::Capture;
 use stspp::cpu_time::{Step, Stopwatch};
 use stspp::reconstruct::{ReconstructError, RectifiedStack};
 use stspp::recording::StereoPair;
 use stspp::rectify::{Rectifier, RectifyScratch};
 use stspp::{Recording, StereoCalibration, report, reproject};
-use stspp_hil_sim::world::{SceneSpec, SensorModel};
 use stspp_matcher::{Matcher, Params};
 
 use crate::exit::{Failure, Kind};
@@ -38,6 +36,17 @@ fn input(args: &Args, output: &Output) -> Result<(StereoCalibration, Vec<StereoP
         let pairs = recording.read_window(0..frames).map_err(failed)?;
         return Ok((recording.calibration, pairs));
     }
+    simulated(frames, output)
+}
+
+#[cfg(feature = "sim")]
+fn simulated(
+    frames: usize,
+    output: &Output,
+) -> Result<(StereoCalibration, Vec<StereoPair>), Failure> {
+    use stspp::accuracy::Capture;
+    use stspp_hil_sim::world::{SceneSpec, SensorModel};
+
     let progress = output.progress(frames as u64, "simulating");
     let failed = |e| Failure::new(Kind::Input, e);
     let scene = SceneSpec::parse("sphere", &[]).map_err(failed)?;
@@ -46,6 +55,11 @@ fn input(args: &Args, output: &Output) -> Result<(StereoCalibration, Vec<StereoP
         .map_err(failed)?;
     progress.finish_and_clear();
     Ok((capture.calibration, capture.pairs))
+}
+
+#[cfg(not(feature = "sim"))]
+fn simulated(_: usize, _: &Output) -> Result<(StereoCalibration, Vec<StereoPair>), Failure> {
+    Err(Failure::new(Kind::Usage, "no recording folder").remedy("this build has no simulator"))
 }
 
 /// Runs the verb.
