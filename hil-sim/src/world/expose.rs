@@ -7,7 +7,7 @@ use nalgebra::Isometry3;
 use rayon::prelude::*;
 
 use super::camera::{CameraModel, full_scale};
-use super::gbuffer::{GBuffer, View};
+use super::gbuffer::{GBuffer, Refinement, View};
 use super::geometry::Rigid;
 use super::illuminate::{ambient, illuminate};
 use super::noise::{KeyedRng, key, read_pixel_e};
@@ -214,11 +214,13 @@ impl CameraUnit {
         let view = self.view();
         let known = self.lock().directions.clone();
         let directions = known.unwrap_or_else(|| Arc::new(view.directions()));
+        let mut refinement = Refinement::Sharp;
         if !scene.is_still() {
+            refinement = Refinement::Coarse;
             // Every frame needs them again.
             self.lock().directions.get_or_insert_with(|| Arc::clone(&directions));
         }
-        GBuffer::new(&view, &directions, &scene.at(time_ns))
+        GBuffer::new(&view, &directions, &scene.at(time_ns), refinement)
     }
 
     /// The image of a still scene, made when first asked for. Nothing is computed under the lock: a

@@ -3,7 +3,7 @@
 //! The image plane is sampled on a grid of cells of half a pixel. The finest dots that the camera
 //! resolves are band limited far below this grid, so summing cells with the lens' and pixel's
 //! response (see [`super::psf`]) gives the irradiance without aliasing. Where the grid would alias, at
-//! edges of objects and prints, the cell is sampled 16 times more finely.
+//! edges of objects and prints, the cell is sampled up to 16 times more finely.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -15,9 +15,13 @@ use super::scene::PosedScene;
 /// Cells per pixel in each direction.
 pub(crate) const CELLS_PER_PIXEL: usize = 2;
 /// Samples along one side of a refined cell.
-const FINE: usize = 4;
-/// Samples of a refined cell.
-pub(crate) const FINE_SAMPLES: usize = FINE * FINE;
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Refinement {
+    /// 4: an edge is placed to 1/8 px, and to much less on average along its length.
+    Sharp = 4,
+    /// 2: enough for a view that is blurred by motion.
+    Coarse = 2,
+}
 /// Nothing is looked for beyond this distance.
 const FARTHEST_M: f64 = 50.0;
 
@@ -137,13 +141,21 @@ pub(crate) struct GBuffer {
     pub cells: Vec<Sample>,
     /// Indices of the refined cells, ascending.
     pub refined: Vec<u32>,
-    /// [`FINE_SAMPLES`] for each refined cell.
+    /// `fine_per_cell` samples for each refined cell.
     pub fine: Vec<Sample>,
+    pub fine_per_cell: usize,
 }
 
 impl GBuffer {
     /// Looks along `directions`, which are the view's own.
-    pub fn new(view: &View<'_>, directions: &[[f32; 2]], scene: &PosedScene<'_>) -> Self {
+    pub fn new(
+        view: &View<'_>,
+        directions: &[[f32; 2]],
+        scene: &PosedScene<'_>,
+        refinement: Refinement,
+    ) -> Self {
+        let side = refinement as usize;
+        let fine_per_cell = side * side;
         let (columns, rows) = (view.columns(), view.rows());
         let mut cells = vec![Sample::NOTHING; columns * rows];
         cells.par_chunks_mut(columns).zip(directions.par_chunks(columns)).for_each(
@@ -178,21 +190,21 @@ impl GBuffer {
         for &index in &refined {
             cells[index as usize].is_edge = true;
         }
-        let mut fine = vec![Sample::NOTHING; refined.len() * FINE_SAMPLES];
-        fine.par_chunks_mut(FINE_SAMPLES).zip(&refined).for_each(|(samples, &index)| {
+        let mut fine = vec![Sample::NOTHING; refined.len() * fine_per_cell];
+        fine.par_chunks_mut(fine_per_cell).zip(&refined).for_each(|(samples, &index)| {
             let (row, column) = (index as usize / columns, index as usize % columns);
-            let offset = |k: usize| (k as f64 + 0.5) / FINE as f64 - 0.5;
+            let offset = |k: usize| (k as f64 + 0.5) / side as f64 - 0.5;
             let centre = [view.pixel(column as f64), view.pixel(row as f64)];
             let near = view.camera.unproject(centre);
             for (k, sample) in samples.iter_mut().enumerate() {
                 let pixel = [
-                    view.pixel(column as f64 + offset(k % FINE)),
-                    view.pixel(row as f64 + offset(k / FINE)),
+                    view.pixel(column as f64 + offset(k % side)),
+                    view.pixel(row as f64 + offset(k / side)),
                 ];
                 *sample = look(scene, &view.ray(view.camera.unproject_from(pixel, near)));
             }
         });
-        Self { columns, cells, refined, fine }
+        Self { columns, cells, refined, fine, fine_per_cell }
     }
 }
 

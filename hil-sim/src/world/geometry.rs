@@ -89,13 +89,46 @@ impl Aabb {
         let mut near = 0.0_f64;
         let mut far = max_m;
         for axis in 0..3 {
-            let inverse = 1.0 / ray.direction[axis];
-            let a = (self.min[axis] - ray.origin[axis]) * inverse;
-            let b = (self.max[axis] - ray.origin[axis]) * inverse;
-            // A ray inside a slab that it is parallel to gives NaN here, which min and max ignore.
+            let (origin, direction) = (ray.origin[axis], ray.direction[axis]);
+            if direction == 0.0 {
+                // Parallel to the slab: 0 times infinity below would be NaN.
+                if origin < self.min[axis] || origin > self.max[axis] {
+                    return false;
+                }
+                continue;
+            }
+            let inverse = 1.0 / direction;
+            let a = (self.min[axis] - origin) * inverse;
+            let b = (self.max[axis] - origin) * inverse;
             near = near.max(a.min(b));
             far = far.min(a.max(b));
         }
         near <= far
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn boxes_are_crossed_also_along_their_faces() {
+        let mut unit = Aabb::EMPTY;
+        unit.include(&Vector3::zeros());
+        unit.include(&Vector3::repeat(1.0));
+        let crossed = |origin: [f64; 3], direction: [f64; 3], max_m| {
+            let ray = Ray {
+                origin: Vector3::from(origin),
+                direction: Vector3::from(direction).normalize(),
+            };
+            unit.is_crossed_by(&ray, max_m)
+        };
+        assert!(crossed([0.5, 0.5, -1.0], [0.0, 0.0, 1.0], 2.0));
+        assert!(!crossed([0.5, 0.5, -1.0], [0.0, 0.0, 1.0], 0.9));
+        assert!(!crossed([0.5, 0.5, -1.0], [0.0, 0.0, -1.0], 9.0));
+        assert!(crossed([0.0, 1.0, -1.0], [0.0, 0.0, 1.0], 2.0));
+        assert!(!crossed([1.1, 0.5, -1.0], [0.0, 0.0, 1.0], 9.0));
+        assert!(crossed([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0], 9.0));
+        assert!(crossed([0.5, 0.5, 0.5], [0.3, -0.2, 0.9], 9.0));
     }
 }

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::gbuffer::{FINE_SAMPLES, GBuffer, Sample};
+use super::gbuffer::{GBuffer, Sample};
 use super::geometry::Ray;
 use super::material::reflectance;
 use super::pattern::{BLOCK, DirectionBlock};
@@ -49,13 +49,13 @@ pub(crate) fn illuminate(
     });
     let refined: Vec<f32> = gbuffer
         .fine
-        .par_chunks(FINE_SAMPLES)
+        .par_chunks(gbuffer.fine_per_cell)
         .map_init(Block::new, |block, samples| {
             block.clear();
             samples.iter().for_each(|s| block.push(*s));
             shader.shadow_edge(block);
             shader.shade(block);
-            block.rates[..FINE_SAMPLES].iter().sum::<f32>() / FINE_SAMPLES as f32
+            block.rates.iter().sum::<f32>() / samples.len() as f32
         })
         .collect();
     for (&index, rate) in gbuffer.refined.iter().zip(refined) {
@@ -68,9 +68,10 @@ pub(crate) fn illuminate(
 pub(crate) fn ambient(gbuffer: &GBuffer, e_per_s: f64) -> Vec<f32> {
     let mut rates: Vec<f32> =
         gbuffer.cells.par_iter().map(|s| (s.albedo() * e_per_s) as f32).collect();
-    for (&index, samples) in gbuffer.refined.iter().zip(gbuffer.fine.chunks(FINE_SAMPLES)) {
+    for (&index, samples) in gbuffer.refined.iter().zip(gbuffer.fine.chunks(gbuffer.fine_per_cell))
+    {
         let sum: f64 = samples.iter().map(Sample::albedo).sum();
-        rates[index as usize] = (sum / FINE_SAMPLES as f64 * e_per_s) as f32;
+        rates[index as usize] = (sum / samples.len() as f64 * e_per_s) as f32;
     }
     rates
 }

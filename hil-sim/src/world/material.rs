@@ -44,9 +44,7 @@ impl Material {
         match &self.texture {
             Texture::Plain(albedo) => *albedo,
             Texture::Mottled { mean, amplitude, grain_m } => {
-                let p = point / *grain_m;
-                let noise = 0.65 * value_noise(&p) + 0.35 * value_noise(&(p * 2.7));
-                mean + amplitude * noise
+                mean + amplitude * value_noise(&(point / *grain_m))
             }
             Texture::Board(board) => board.albedo(point.x, point.y),
         }

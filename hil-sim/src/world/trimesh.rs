@@ -12,7 +12,7 @@ use obvhs::aabb::Aabb as Box32;
 use obvhs::cwbvh::{CwBvh, builder::build_cwbvh};
 use obvhs::ray::{Ray as Ray32, RayHit as Hit32};
 
-use super::geometry::{Hit, Ray};
+use super::geometry::{Aabb, Hit, Ray};
 use super::shapes::Shape;
 
 /// Facets that meet at less than this angle are one smooth surface, for shading.
@@ -33,6 +33,7 @@ pub(crate) struct TriangleMesh {
     /// In the order of the hierarchy's leaves.
     facets: Vec<Facet>,
     bvh: CwBvh,
+    bounds: Aabb,
 }
 
 struct Facet {
@@ -113,10 +114,18 @@ impl TriangleMesh {
                 Facet { corner: a, edges: [b - a, c - a], normals }
             })
             .collect();
-        Self { triangles, facets, bvh }
+        let mut bounds = Aabb::EMPTY;
+        triangles.vertices.iter().for_each(|v| bounds.include(v));
+        let slack = Vector3::repeat(f64::from(size) * f64::from(BOX_MARGIN));
+        bounds = Aabb { min: bounds.min - slack, max: bounds.max + slack };
+        Self { triangles, facets, bvh, bounds }
     }
 
     fn nearest(&self, ray: &Ray, max_m: f64) -> Option<(usize, Crossing)> {
+        // Most rays of a camera miss; this finds out sooner than the hierarchy.
+        if !self.bounds.is_crossed_by(ray, max_m) {
+            return None;
+        }
         let mut best: Option<(usize, Crossing)> = None;
         let mut found = Hit32::none();
         self.bvh.ray_traverse(ray32(ray, max_m), &mut found, |_, index| {
@@ -196,12 +205,13 @@ impl Shape for Arc<TriangleMesh> {
     }
 
     fn occludes(&self, ray: &Ray, max_m: f64) -> bool {
-        !self.bvh.ray_traverse_miss(ray32(ray, max_m), |_, index| {
-            match self.facets[index].cross(ray, max_m) {
-                Some(_) => 0.0,
-                None => f32::INFINITY,
-            }
-        })
+        self.bounds.is_crossed_by(ray, max_m)
+            && !self.bvh.ray_traverse_miss(ray32(ray, max_m), |_, index| {
+                match self.facets[index].cross(ray, max_m) {
+                    Some(_) => 0.0,
+                    None => f32::INFINITY,
+                }
+            })
     }
 
     fn triangles(&self) -> Option<&Triangles> {
