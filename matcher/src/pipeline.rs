@@ -3,9 +3,10 @@
 use std::time::Instant;
 
 use crate::{
-    Error, Image, Level, Matched, Method, Params, StageTime, StereoStack,
+    Error, Image, Level, Matched, Method, Params, ShapeFunction, StageTime, StereoStack,
     census::{PaddedStack, Side},
     check,
+    dense::{DenseMaps, order::OrderChoice},
     fast::Fast,
     icgn::{field::Field, guess::CoarseMap, prepare::Prepared},
     parallel::Pool,
@@ -30,6 +31,7 @@ pub struct Matcher {
     prepared: Prepared,
     map: CoarseMap,
     field: Field,
+    order: OrderChoice,
     /// Made by the first frame that needs it.
     fast: Option<Fast>,
 }
@@ -52,6 +54,7 @@ impl Matcher {
             prepared: Prepared::default(),
             map: CoarseMap::default(),
             field: Field::default(),
+            order: OrderChoice::default(),
             fast: None,
         })
     }
@@ -132,10 +135,17 @@ impl Matcher {
         self.prepared.fill(stack, self.params.advanced.interpolation);
         self.map.fill(&coarse.disparity_px);
         clock.stage("prepare");
-        let Self { field, prepared, map, params, level, .. } = self;
+        let Self { field, prepared, map, order, params, level, .. } = self;
         field.refine(prepared, map, stack.left_mask, params, *level);
         clock.stage("icgn");
         let (mut disparity_px, mut zncc) = (field.disparity_px(), field.zncc());
+        if params.shape == ShapeFunction::Auto {
+            let first_px = field.first_order_px(prepared, map, params, *level);
+            let mut maps = DenseMaps { first_px, second_px: disparity_px.clone(), zncc };
+            order.choose(level.usable(), params.zncc_min, &mut maps, &mut disparity_px);
+            zncc = maps.zncc;
+            clock.stage("order");
+        }
         check::remove_small_regions(&mut disparity_px, params.advanced.region_min);
         for (z, d) in zncc.as_mut_slice().iter_mut().zip(disparity_px.as_slice()) {
             *z = if d.is_nan() { f32::NAN } else { *z };

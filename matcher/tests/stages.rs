@@ -306,7 +306,8 @@ fn initial_guess_is_the_least_squares_surface() {
     coarse.fill(&map);
     let mut part = Window::empty();
     for order in [1usize, 2] {
-        let guesser = Guesser::new(4, if order == 1 { 3 } else { 6 }, 1.5, &prepared);
+        let guesser =
+            Guesser::new(4, if order == 1 { 3 } else { 6 }, 1.5, &prepared, Level::best());
         for (x, full) in [(20i32, true), (38, false), (41, false)] {
             let guess = guesser.guess(&coarse, &prepared, x as usize, 12, &mut part);
             let (shape, is_full) = match guess {

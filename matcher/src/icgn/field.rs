@@ -82,6 +82,38 @@ impl Field {
         self.grow(&refiner, map, left_mask);
     }
 
+    /// First-order estimates of the refined points, from their second-order ones; those themselves
+    /// where no other can be had. `map`: as [`Field::refine`] left it.
+    pub fn first_order_px(
+        &self,
+        prepared: &Prepared,
+        map: &CoarseMap,
+        params: &Params,
+        level: Level,
+    ) -> Image<f32> {
+        let refiner = Refiner::new(prepared, params, true, level);
+        let width = self.width;
+        let mut out = self.disparity_px();
+        out.as_mut_slice().par_chunks_mut(width * BAND).enumerate().for_each(|(band, out)| {
+            for first in (0..width).step_by(TILE) {
+                for (row, out) in out.chunks_exact_mut(width).enumerate() {
+                    let y = band * BAND + row;
+                    let last = (first + TILE).min(width);
+                    for (x, value) in (first..last).zip(&mut out[first..last]) {
+                        let point = &self.points[y * width + x];
+                        if point.is_none() {
+                            continue;
+                        }
+                        if let Some(r) = refiner.first_order(map, x, y, point.moved(0.0, 0.0)) {
+                            *value = -r.shape.0[0] as f32;
+                        }
+                    }
+                }
+            }
+        });
+        out
+    }
+
     /// Disparity of every point; NaN where there is none.
     pub fn disparity_px(&self) -> Image<f32> {
         self.image(|p| -p.shape[0])

@@ -7,7 +7,7 @@ use super::{
     solve::Cholesky,
     window::{ROWS_MAX, Window},
 };
-use crate::{Image, bspline::LANES, check::STEP_PX};
+use crate::{Image, Level, bspline::LANES, check::STEP_PX, lanes::vectorised};
 
 /// Coarse disparities with margins of NaN, so that subsets at the border need no special case.
 #[derive(Debug, Default)]
@@ -38,6 +38,12 @@ impl CoarseMap {
         self.values[(MARGIN + y) * self.pitch + MARGIN + x]
     }
 
+    /// From the first of the [`LANES`] columns of the square's first row to those of its last.
+    fn square(&self, x: usize, y: usize, radius: usize) -> &[f32] {
+        let at = (MARGIN + y - radius) * self.pitch + MARGIN + x - radius;
+        &self.values[at..at + 2 * radius * self.pitch + LANES]
+    }
+
     /// [`LANES`] columns from x - radius on, of row y + dy.
     fn lanes(&self, x: usize, y: usize, dy: isize, radius: usize) -> &[f32; LANES] {
         let row = (MARGIN + y).wrapping_add_signed(dy);
@@ -49,6 +55,7 @@ impl CoarseMap {
 /// Finds initial guesses for subsets of one radius and order.
 #[derive(Debug)]
 pub struct Guesser {
+    level: Level,
     radius: usize,
     parameters: usize,
     surface_px: f32,
@@ -70,7 +77,13 @@ pub enum Guess {
 impl Guesser {
     /// A guesser for subsets of `radius`, shape functions of 3 or 6 `parameters`, and pixels within
     /// `surface_px` of the fit.
-    pub fn new(radius: usize, parameters: usize, surface_px: f32, prepared: &Prepared) -> Self {
+    pub fn new(
+        radius: usize,
+        parameters: usize,
+        surface_px: f32,
+        prepared: &Prepared,
+        level: Level,
+    ) -> Self {
         let full = Window::full(radius, prepared);
         let mut inverse = vec![[[0.0; LANES]; ROWS_MAX]; parameters];
         let mut normal = [[0.0; 6]; 6];
@@ -82,7 +95,7 @@ impl Guesser {
             let (row, lane) = ((dy + radius as i32) as usize, (dx + radius as i32) as usize);
             inverse.iter_mut().zip(solution).for_each(|(i, s)| i[row][lane] = s as f32);
         }
-        Self { radius, parameters, surface_px, inverse, full }
+        Self { level: level.usable(), radius, parameters, surface_px, inverse, full }
     }
 
     /// Radius of the square.
@@ -123,6 +136,18 @@ impl Guesser {
         });
     }
 
+    /// Whether the whole square about (x, y) belongs to the centre's surface and is seen by the right
+    /// camera when warped by `shape`.
+    pub(super) fn is_full(
+        &self,
+        map: &CoarseMap,
+        prepared: &Prepared,
+        (x, y): (usize, usize),
+        shape: &Shape,
+    ) -> bool {
+        self.guess_full(map, x, y).is_some() && self.right_side_is_inside(prepared, shape, x, y)
+    }
+
     /// Starts the subset about (x, y), whose coarse disparity is a number; selects into `part` when
     /// not all of the square belongs to the surface.
     pub fn guess(
@@ -146,40 +171,21 @@ impl Guesser {
 
     /// The fit over the whole square, if all of it is within the tolerance.
     fn guess_full(&self, map: &CoarseMap, x: usize, y: usize) -> Option<Shape> {
-        let side = 2 * self.radius + 1;
         let centre = map.at(x, y);
-        let mut rows = [[0f32; LANES]; ROWS_MAX];
-        let mut sums = [[0f32; LANES]; 6];
-        for (r, row) in rows[..side].iter_mut().enumerate() {
-            let values = map.lanes(x, y, r as isize - self.radius as isize, self.radius);
-            for lane in 0..side {
-                row[lane] = values[lane] - centre;
-            }
-            for (sum, inverse) in sums.iter_mut().zip(&self.inverse) {
-                for lane in 0..LANES {
-                    sum[lane] += inverse[r][lane] * row[lane];
-                }
-            }
-        }
-        let fit = sums.map(|s| s.iter().sum::<f32>());
-        // NaN anywhere in the square ends here.
-        if !fit.iter().sum::<f32>().is_finite() {
-            return None;
-        }
-        let mut worst = [0f32; LANES];
-        for (r, row) in rows[..side].iter().enumerate() {
-            let dy = r as f32 - self.radius as f32;
-            let constant = fit[0] + dy * (fit[2] + 0.5 * dy * fit[4]);
-            let slope = fit[1] + dy * fit[5];
-            for lane in 0..LANES {
-                let dx = lane as f32 - self.radius as f32;
-                let error = row[lane] - (constant + dx * (slope + 0.5 * dx * fit[3]));
-                let inside = if lane < side { error.abs() } else { 0.0 };
-                worst[lane] = worst[lane].max(inside);
-            }
-        }
-        let worst = worst.iter().copied().fold(0.0, f32::max);
-        (worst <= self.surface_px).then(|| shape(fit.map(f64::from), centre))
+        let mut fit = Fit::default();
+        vectorised!(
+            self.level,
+            fit_square(
+                values: &[f32] = map.square(x, y, self.radius),
+                pitch: usize = map.pitch,
+                radius: usize = self.radius,
+                inverse: &[[[f32; LANES]; ROWS_MAX]] = &self.inverse,
+                fit: &mut Fit = &mut fit,
+            )
+        );
+        // Not a number where a disparity is missing: no comparison holds then.
+        let whole = fit.worst <= self.surface_px && fit.parameters.iter().all(|p| p.is_finite());
+        whole.then(|| shape(fit.parameters.map(f64::from), centre))
     }
 
     /// Whether all right columns of the full square are inside the image and mask, with a pixel to
@@ -306,6 +312,59 @@ impl Guesser {
         }
         None
     }
+}
+
+/// A fit over a whole square.
+#[derive(Debug, Default)]
+struct Fit {
+    /// Relative to the centre's disparity.
+    parameters: [f32; 6],
+    /// Largest distance of a pixel from it.
+    worst: f32,
+}
+
+/// Fits the square whose rows start `pitch` apart, and finds the largest residual. NaN in the square
+/// makes every parameter NaN.
+#[inline(always)]
+fn fit_square(
+    values: &[f32],
+    pitch: usize,
+    radius: usize,
+    inverse: &[[[f32; LANES]; ROWS_MAX]],
+    fit: &mut Fit,
+) {
+    let side = 2 * radius + 1;
+    let centre = values[radius * pitch + radius];
+    let mut rows = [[0f32; LANES]; ROWS_MAX];
+    let mut sums = [[0f32; LANES]; 6];
+    for (r, row) in rows[..side].iter_mut().enumerate() {
+        let values: &[f32; LANES] =
+            values[r * pitch..][..LANES].try_into().expect("a slice of LANES values");
+        for lane in 0..LANES {
+            // Lanes beyond the square may hold anything.
+            row[lane] = if lane < side { values[lane] - centre } else { 0.0 };
+        }
+        for (sum, inverse) in sums.iter_mut().zip(inverse) {
+            for lane in 0..LANES {
+                sum[lane] += inverse[r][lane] * row[lane];
+            }
+        }
+    }
+    let p = sums.map(|s| s.iter().sum::<f32>());
+    let mut worst = [0f32; LANES];
+    for (r, row) in rows[..side].iter().enumerate() {
+        let dy = r as f32 - radius as f32;
+        let constant = p[0] + dy * (p[2] + 0.5 * dy * p[4]);
+        let slope = p[1] + dy * p[5];
+        for lane in 0..LANES {
+            let dx = lane as f32 - radius as f32;
+            let error = (row[lane] - (constant + dx * (slope + 0.5 * dx * p[3]))).abs();
+            let error = if lane < side { error } else { 0.0 };
+            worst[lane] = if error > worst[lane] { error } else { worst[lane] };
+        }
+    }
+    fit.parameters = p;
+    fit.worst = worst.iter().fold(0.0, |a, &b| if b > a { b } else { a });
 }
 
 /// Offsets of a square of pixels.

@@ -61,7 +61,7 @@ impl<'a> Refiner<'a> {
         Self {
             prepared,
             kernels: [3, 6].map(|parameters| Kernel::new(level, prepared.kind, parameters)),
-            guesser: Guesser::new(radius, parameters, surface_px, prepared),
+            guesser: Guesser::new(radius, parameters, surface_px, prepared, level),
             second,
             convergence_px: advanced.convergence_px,
             iterations_max: advanced.iterations_max,
@@ -102,6 +102,18 @@ impl<'a> Refiner<'a> {
         let refined = self.refine(part, x, y, start)?;
         let near = (refined.shape.0[0] - start.0[0]).abs() <= GROWTH_STEP_PX;
         (near && self.belongs(map, x, y, &refined, part)).then_some(refined)
+    }
+
+    /// The first-order estimate of a point whose second-order one is `shape`, where the whole square
+    /// belongs to the surface: elsewhere there is nothing to choose between.
+    fn first_order(&self, map: &CoarseMap, x: usize, y: usize, shape: Shape) -> Option<Refined> {
+        let mut start = shape;
+        start.0[3..].fill(0.0);
+        if !self.guesser.is_full(map, self.prepared, (x, y), &start) {
+            return None;
+        }
+        let refined = self.iterate::<3>(self.guesser.full(), x, y, start)?;
+        (refined.zncc >= self.zncc_min).then_some(refined)
     }
 
     /// Gauss-Newton from `start`, to second order where that is asked for, the subset is large enough
