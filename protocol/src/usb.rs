@@ -2,8 +2,9 @@
 //!
 //! One configuration, one vendor-specific interface, three endpoints, full speed. Bytes on the bulk
 //! endpoints are the same COBS frames as on the serial link; a frame may span packets and a packet may
-//! hold several frames. Events come over the interrupt endpoint, one frame per transfer, so that a host
-//! waiting for a reply is never delayed by events and the other way round.
+//! hold several frames. Events come over the interrupt endpoint, whole frames, several in a transfer where
+//! they have queued up, so that a host waiting for a reply is never delayed by events and the other way
+//! round.
 
 /// Vendor id: pid.codes, the registry for open-source hardware.
 pub const VENDOR_ID: u16 = 0x1209;

@@ -64,9 +64,9 @@ fn settle(controller: &mut Controller) {
     }
 }
 
-/// Takes the next event as a frame.
+/// Takes the next event as a frame, if one waits.
 #[inline(never)]
-fn take_event(out: &mut [u8; MAX_FRAME_LEN]) -> Option<usize> {
+pub(crate) fn take_event(out: &mut [u8; MAX_FRAME_LEN]) -> Option<usize> {
     with_controller(|controller, _| controller.next_event(out))
 }
 

@@ -1,6 +1,7 @@
 //! The serial link: requests from the receive ring, replies and events on one line.
 
 use crate::shared::{self, ReplySink};
+use embassy_futures::yield_now;
 use embassy_gd32f3x0::peripherals::USART0;
 use embassy_gd32f3x0::usart::{Error, Reader, Writer};
 use embassy_sync::blocking_mutex::raw::ThreadModeRawMutex;
@@ -49,6 +50,8 @@ pub(crate) async fn link(mut reader: Reader<USART0>, line: &'static Line) {
                 panic!("receive DMA");
             }
         }
+        // However fast the host is, the other tasks get their turn.
+        yield_now().await;
         let errors = reader.take_line_errors();
         if errors != 0 {
             defmt::debug!("serial: {=u32} line errors", errors);

@@ -3,6 +3,7 @@
 
 use crate::Irqs;
 use crate::shared::{self, ReplySink};
+use embassy_futures::yield_now;
 use embassy_gd32f3x0::Peri;
 use embassy_gd32f3x0::peripherals::{PA11, PA12, USBFS};
 use embassy_gd32f3x0::reset;
@@ -12,6 +13,7 @@ use embassy_usb::msos::{
     CompatibleIdFeatureDescriptor, PropertyData, RegistryPropertyFeatureDescriptor, windows_version,
 };
 use embassy_usb::{Builder, Config, Handler, UsbDevice, UsbVersion};
+use heapless::Vec;
 use static_cell::StaticCell;
 use stspp_protocol::usb as ids;
 use stspp_protocol::version::SerialNumber;
@@ -184,19 +186,32 @@ pub(crate) async fn link(mut requests: Endpoint<'static, Out>, replies: Endpoint
         requests.wait_enabled().await;
         while let Ok(count) = requests.read(&mut bytes).await {
             shared::serve(&bytes[..count], &mut replies).await;
+            // However fast the host is, the other tasks get their turn.
+            yield_now().await;
         }
     }
 }
 
-/// Events.
+/// Events. Those that have queued up share a packet: the host polls once a millisecond, and at the
+/// highest slot rate there is an event in each.
 #[embassy_executor::task]
 pub(crate) async fn events(mut endpoint: Endpoint<'static, In>) {
-    let mut out = [0; MAX_FRAME_LEN];
+    let mut frame = [0; MAX_FRAME_LEN];
+    let mut held = 0;
+    let mut transfer: Vec<u8, MAX_FRAME_LEN> = Vec::new();
     loop {
         endpoint.wait_enabled().await;
-        let length = shared::next_event(&mut out).await;
-        if write(&mut endpoint, &out[..length]).await.is_err() {
-            defmt::debug!("usb: event dropped, the host is gone");
+        if held == 0 {
+            held = shared::next_event(&mut frame).await;
+        }
+        transfer.clear();
+        while held != 0 && (transfer.is_empty() || transfer.len() + held <= ids::MAX_PACKET_LEN) {
+            // There is room: for one frame of any length, or for what fits a packet.
+            let _ = transfer.extend_from_slice(&frame[..held]);
+            held = shared::take_event(&mut frame).unwrap_or(0);
+        }
+        if write(&mut endpoint, &transfer).await.is_err() {
+            defmt::debug!("usb: events dropped, the host is gone");
         }
     }
 }
