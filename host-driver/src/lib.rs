@@ -4,6 +4,15 @@
 //! Lengths are metres, the frame is the left camera's optical frame (+x right, +y down, +z forward,
 //! origin at the centre of the unrectified camera 0), transforms are named `a_from_b`, an invalid
 //! pixel is NaN.
+//!
+//! ```no_run
+//! let mut sensor = stspp::Sensor::open("sim:")?;
+//! sensor.set_timing(stspp::ProjectionTiming::default())?;
+//! for frame in sensor.stream()? {
+//!     frame?.point_cloud().write_ply("cloud.ply")?;
+//! }
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 #[cfg(feature = "sim")]
 pub mod accuracy;

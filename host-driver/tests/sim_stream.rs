@@ -108,3 +108,75 @@ fn a_replay_equals_the_reconstruction_of_the_same_folder() {
     assert_eq!(frames[0].labels, reconstructed.frame.labels);
     assert_ne!(bits(&frames[1]), bits(&frames[0]));
 }
+
+fn mean_intensity(frame: &DepthFrame) -> f64 {
+    let sum: u64 = frame.intensity.as_slice().iter().map(|&v| u64::from(v)).sum();
+    sum as f64 / frame.intensity.as_slice().len() as f64
+}
+
+#[test]
+fn a_floodlight_slot_gives_the_brightness_and_is_not_matched() {
+    let mut sensor = Sensor::open("sim:plane?scale=8").unwrap();
+    let without = sensor.stream().unwrap().next().unwrap().unwrap();
+    let slots = (0..10).map(Slot::projector).chain([Slot::floodlight()]).collect();
+    sensor.set_timing(ProjectionTiming { slots, ..Default::default() }).unwrap();
+    let mut stream = sensor.stream().unwrap();
+    let frames: Vec<DepthFrame> = stream.by_ref().take(3).map(Result::unwrap).collect();
+    for frame in &frames {
+        assert_eq!(frame.labels.len(), 10);
+        assert!(frame.labels.iter().all(|l| !l.floodlight && l.projector_mask != 0));
+    }
+    // The second window ends after the first floodlight frame, which lights the plane evenly.
+    let spread = |frame: &DepthFrame| {
+        let mean = mean_intensity(frame);
+        let values = frame.intensity.as_slice().iter().filter(|v| **v > 0);
+        let (sum, n) =
+            values.fold((0.0, 0), |(sum, n), &v| (sum + (f64::from(v) - mean).abs(), n + 1));
+        sum / f64::from(n) / mean
+    };
+    assert!(spread(&frames[1]) < spread(&without), "{} {}", spread(&frames[1]), spread(&without));
+    assert_ne!(mean_intensity(&frames[0]).round(), mean_intensity(&frames[1]).round());
+    assert_eq!(stream.stats().window_gaps, 0);
+}
+
+#[test]
+fn a_window_may_be_shorter_than_the_cycle() {
+    let mut sensor = Sensor::open("sim:plane?scale=8").unwrap();
+    let mut options = stspp::StreamOptions::default();
+    options.matching.frames = Some(3);
+    let frames: Vec<DepthFrame> =
+        sensor.stream_with(&options).unwrap().take(9).map(Result::unwrap).collect();
+    for (k, frame) in (0u32..).zip(&frames) {
+        let sequences: Vec<u32> = frame.labels.iter().map(|l| l.sequence).collect();
+        assert_eq!(sequences, [k, k + 1, k + 2]);
+    }
+    options.matching.frames = Some(17);
+    assert!(matches!(sensor.stream_with(&options), Err(Error::Match(_))));
+}
+
+#[test]
+fn at_wall_pace_a_slow_machine_skips_windows_and_says_so() {
+    let mut sensor = Sensor::open("sim:plane?scale=8&pace=real").unwrap();
+    let mut stream = sensor.stream().unwrap();
+    for result in stream.by_ref().take(4) {
+        let frame = match result {
+            Ok(frame) => frame,
+            // On a very slow machine too many images are lost; that is said, and nothing is made up.
+            Err(Error::Timeout(_)) => continue,
+            Err(error) => panic!("{error}"),
+        };
+        let sequences: Vec<u32> = frame.labels.iter().map(|l| l.sequence).collect();
+        assert_eq!(sequences.len(), 10);
+        assert!(sequences.windows(2).all(|s| s[1] == s[0] + 1), "{sequences:?}");
+        let depth_m = median_depth_m(&frame);
+        assert!((depth_m - 1.0).abs() < 0.08, "median {depth_m} m");
+        assert!(frame.arrived.is_some());
+    }
+    let stats = stream.finish();
+    assert!(stats.windows >= stats.depth_frames + stats.skipped_windows, "{stats:?}");
+    assert_eq!(
+        stats.frames_left + stats.frames_right,
+        2 * stats.pairs + stats.rejected.total() + stats.dropped_capture,
+        "{stats:?}"
+    );
+}

@@ -6,9 +6,9 @@ use std::time::Duration;
 use crossbeam_channel::{Receiver, SendTimeoutError, Sender};
 use stspp_matcher::{Image, Matcher, Params, Sample, StereoStack};
 
-use super::LabelledPair;
 use super::stats::{Mark, Progress};
 use super::stream::StopHandle;
+use super::{LabelledPair, PAIR_QUEUE};
 use crate::clock::Clock;
 use crate::error::Error;
 use crate::reconstruct::{FRAMES_DEFAULT, FRAMES_MAX, Options};
@@ -203,6 +203,8 @@ pub(crate) struct MatchThread {
     pub stop: StopHandle,
     pub lossless: bool,
     pub live: bool,
+    /// Windows skipped since the last match.
+    pub skipped_in_row: usize,
 }
 
 impl MatchThread {
@@ -248,11 +250,14 @@ impl MatchThread {
 
     fn complete(&mut self, pair: &LabelledPair) -> bool {
         self.progress.count(|s| s.windows += 1);
-        // When a newer pair waits already, this window is late: the newest is matched.
-        if !self.lossless && !self.input.is_empty() {
+        // When a newer pair waits already, this window is late: the newest is matched. A machine on which
+        // one always waits matches now and then all the same.
+        if !self.lossless && !self.input.is_empty() && self.skipped_in_row < PAIR_QUEUE {
+            self.skipped_in_row += 1;
             self.progress.count(|s| s.skipped_windows += 1);
             return true;
         }
+        self.skipped_in_row = 0;
         let frame = self.engine.match_window();
         self.progress.mark(Mark::Window, self.clock.now_ns());
         match frame {

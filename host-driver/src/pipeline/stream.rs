@@ -353,6 +353,7 @@ pub(crate) fn depth(source: PairSource, options: &StreamOptions) -> Result<Depth
         stop: threads.stop.clone(),
         lossless,
         live,
+        skipped_in_row: 0,
     };
     threads.spawn("match", move || matching.run())?;
     Ok(DepthStream { results, threads, info })

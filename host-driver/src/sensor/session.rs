@@ -91,8 +91,8 @@ impl Session {
     /// Starts the cameras, then the light: the first exposure has its frame.
     pub fn start(&self) -> Result<Started, Error> {
         self.arm()?;
-        self.cameras().start()?;
-        let started = self.start_light();
+        let cameras = self.cameras().start();
+        let started = cameras.map_err(Error::from).and_then(|()| self.start_light());
         if started.is_err() {
             self.stop();
         }
