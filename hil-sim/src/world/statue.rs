@@ -16,7 +16,7 @@ pub(crate) const HEIGHT_M: f64 = 0.7;
 /// Largest distance of its surface from its vertical axis.
 pub(crate) const REACH_M: f64 = 0.21;
 /// Grid pitch of its triangles.
-const PITCH_M: f64 = 0.0016;
+const PITCH_M: f64 = 0.0018;
 /// Middle of the head.
 const HEAD: Vector3<f64> = Vector3::new(0.0, 0.552, 0.0);
 
