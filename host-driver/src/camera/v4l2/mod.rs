@@ -1,7 +1,7 @@
 //! Cameras behind the kernel's Video4Linux2 interface: two video nodes, or one with both pictures
 //! side by side.
 //!
-//! [`ioctl`] are the system calls, [`node`] an open node, [`pixels`] what a picture's bytes mean,
+//! `ioctl` are the system calls, [`node`] an open node, [`pixels`] what a picture's bytes mean,
 //! [`metadata`] the camera's own clock, [`topology`] which nodes belong together.
 //!
 //! A frame's sequence number is the driver's count since the stream's start. Its camera time is the
