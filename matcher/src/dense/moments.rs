@@ -19,6 +19,67 @@ pub(crate) fn powers(radius: usize) -> Powers {
     })
 }
 
+/// Moves the sums over a column of rows on by one, and sums 2 `radius` + 1 of them per pixel:
+/// `column` += `enters` - `leaves`. Exact, and so independent of where the sliding began, as long as
+/// the values are whole numbers and a column's sum is below 2^24.
+pub(crate) fn slide_sum(
+    level: Level,
+    (enters, leaves): (&[f32], &[f32]),
+    radius: usize,
+    len: usize,
+    column: &mut [f32],
+    out: &mut [f32],
+) {
+    let padded = len + 2 * PAD;
+    assert!(radius <= PAD && len.is_multiple_of(WIDEST));
+    assert!(enters.len() >= padded && leaves.len() >= padded);
+    assert!(column.len() >= padded && out.len() >= padded);
+    dispatch!(
+        level,
+        slide_lanes(
+            enters: &[f32] = enters,
+            leaves: &[f32] = leaves,
+            radius: usize = radius,
+            len: usize = len,
+            column: &mut [f32] = column,
+            out: &mut [f32] = out,
+        )
+    );
+}
+
+#[inline(always)]
+fn slide_lanes<V: Lanes>(
+    enters: &[f32],
+    leaves: &[f32],
+    radius: usize,
+    len: usize,
+    column: &mut [f32],
+    out: &mut [f32],
+) {
+    for i in (PAD..PAD + len).step_by(V::COUNT) {
+        // SAFETY: `i + COUNT <= PAD + len`, as `len` is a multiple of COUNT.
+        unsafe {
+            let change = V::load(enters.as_ptr().add(i)).sub(V::load(leaves.as_ptr().add(i)));
+            V::load(column.as_ptr().add(i)).add(change).store(column.as_mut_ptr().add(i));
+        }
+    }
+    across::<V>(radius, len, column, out);
+}
+
+/// Sums over columns.
+#[inline(always)]
+fn across<V: Lanes>(radius: usize, len: usize, column: &[f32], out: &mut [f32]) {
+    for i in (PAD..PAD + len).step_by(V::COUNT) {
+        let mut sum = V::splat(0.0);
+        for j in 0..2 * radius + 1 {
+            // SAFETY: `i - radius >= 0` and `i + radius + COUNT <= len + 2 PAD`.
+            sum = sum.add(unsafe { V::load(column.as_ptr().add(i - radius + j)) });
+        }
+        // SAFETY: as above.
+        unsafe { sum.store(out.as_mut_ptr().add(i)) };
+    }
+}
+
 /// Sum over the 2 `radius` + 1 `rows` and as many columns. All rows, `column` and `out` are padded
 /// rows of `PAD + len + PAD` values with zeros in the pads; `column` is scratch.
 pub(crate) fn box_sum(
@@ -62,15 +123,7 @@ fn box_lanes<V: Lanes>(
         // SAFETY: as above.
         unsafe { sum.store(column.as_mut_ptr().add(i)) };
     }
-    for i in (PAD..PAD + len).step_by(V::COUNT) {
-        let mut sum = V::splat(0.0);
-        for j in 0..2 * radius + 1 {
-            // SAFETY: `i - radius >= 0` and `i + radius + COUNT <= len + 2 PAD`.
-            sum = sum.add(unsafe { V::load(column.as_ptr().add(i - radius + j)) });
-        }
-        // SAFETY: as above.
-        unsafe { sum.store(out.as_mut_ptr().add(i)) };
-    }
+    across::<V>(radius, len, column, out);
 }
 
 /// Horizontal moments of one padded row: `out[k][i]` = sum over j of (j / radius)^k row[i + j].

@@ -1,13 +1,13 @@
 //! ZNSSD's terms per pixel: from windowed sums the right image's gain and offset against the left,
 //! and from them the quantity whose windowed fit is the disparity, q = S w - (1 - dw/dx) b.
 
-use super::moments::PAD;
+use super::{gradient::SQUARE_UNIT, moments::PAD};
 use crate::{
     Level,
     lanes::{Lanes, WIDEST, dispatch},
 };
 
-/// Windowed sums of a row (padded rows).
+/// Windowed sums of a row (padded rows); those of squares in [`SQUARE_UNIT`].
 pub(crate) struct Windowed<'a> {
     /// Valid pixels.
     pub n: &'a [f32],
@@ -63,8 +63,9 @@ fn gain_lanes<V: Lanes>(
     for i in (PAD..PAD + len).step_by(V::COUNT) {
         // SAFETY: rows hold `len + 2 PAD` values.
         let load = |row: &[f32]| unsafe { V::load(row.as_ptr().add(i)) };
-        let (n, l, ll) = (load(windowed.n), load(windowed.l), load(windowed.ll));
-        let (g, gg) = (load(windowed.g), load(windowed.gg));
+        let unit = V::splat(SQUARE_UNIT);
+        let (n, l, ll) = (load(windowed.n), load(windowed.l), load(windowed.ll).mul(unit));
+        let (g, gg) = (load(windowed.g), load(windowed.gg).mul(unit));
         let samples = n.mul(V::splat(frames));
         let some = V::splat(0.5).lt(n);
         let per = V::splat(1.0).div(V::select(some, samples, V::splat(1.0)));
@@ -194,8 +195,9 @@ fn zncc_lanes<V: Lanes>(
     for i in (PAD..PAD + len).step_by(V::COUNT) {
         // SAFETY: rows hold `len + 2 PAD` values.
         let load = |row: &[f32]| unsafe { V::load(row.as_ptr().add(i)) };
-        let (n, l, ll) = (load(windowed.n), load(windowed.l), load(windowed.ll));
-        let (g, gg, lg) = (load(windowed.g), load(windowed.gg), load(lg));
+        let unit = V::splat(SQUARE_UNIT);
+        let (n, l, ll) = (load(windowed.n), load(windowed.l), load(windowed.ll).mul(unit));
+        let (g, gg, lg) = (load(windowed.g), load(windowed.gg).mul(unit), load(lg).mul(unit));
         let samples = n.mul(V::splat(frames));
         let some = V::splat(0.5).lt(n);
         let per = one.div(V::select(some, samples, one));

@@ -10,7 +10,7 @@
 
 use super::{
     gradient::{Static, static_row},
-    moments::{PAD, Powers, box_sum, horizontal, powers},
+    moments::{PAD, Powers, horizontal, powers, slide_sum},
     normalise::{Terms, Windowed, gain_row, product_row, residual_row, restart_row, zncc_row},
     refit::{Window, refit_row},
     solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
@@ -114,7 +114,8 @@ pub(crate) struct Tile {
     words: usize,
     gradient: Vec<i32>,
     grey: Vec<i32>,
-    column: Vec<f32>,
+    /// Column sums of the eight maps that windows sum, sliding down.
+    columns: [Vec<f32>; 8],
     flagged: Vec<f32>,
     powers: Powers,
     w0: Ring,
@@ -158,10 +159,10 @@ struct Pass {
 
 impl Pass {
     fn resize(&mut self, stride: usize, window: usize) {
-        for ring in [&mut self.at, &mut self.valid, &mut self.ig, &mut self.g, &mut self.gg] {
-            ring.resize(stride, window);
+        for ring in [&mut self.valid, &mut self.g, &mut self.gg, &mut self.lg] {
+            ring.resize(stride, window + 1);
         }
-        for ring in [&mut self.lg, &mut self.q].into_iter().chain(&mut self.hq) {
+        for ring in [&mut self.at, &mut self.ig, &mut self.q].into_iter().chain(&mut self.hq) {
             ring.resize(stride, window);
         }
     }
@@ -193,8 +194,10 @@ impl Tile {
         self.words = pairs * len;
         self.gradient.resize(self.words * window, 0);
         self.grey.resize(self.words * window, 0);
-        self.column.clear();
-        self.column.resize(stride, 0.0);
+        for column in &mut self.columns {
+            column.clear();
+            column.resize(stride, 0.0);
+        }
         self.flagged.resize(len, 0.0);
         self.powers = powers(radius);
         for ring in [&mut self.w0, &mut self.s_used] {
@@ -203,8 +206,10 @@ impl Tile {
         for ring in [&mut self.s, &mut self.il, &mut self.i, &mut self.l, &mut self.ll] {
             ring.resize(stride, window);
         }
-        for ring in [&mut self.l_used, &mut self.ll_used, &mut self.w1] {
-            ring.resize(stride, window);
+        self.w1.resize(stride, window);
+        // Window sums slide: the row that leaves is one behind the window.
+        for ring in [&mut self.l_used, &mut self.ll_used] {
+            ring.resize(stride, window + 1);
         }
         for ring in self.hs.iter_mut().chain(&mut self.sums) {
             ring.resize(stride, window);
@@ -243,11 +248,16 @@ impl Tile {
             self.enter(job, y, (x0, x1), inside(y));
             if y - r >= top - 2 * r {
                 self.normalise(job, y - r);
+            } else {
+                self.begin_columns(y, false);
             }
-            if y - 2 * r >= top - r {
-                self.first_fit(job, y - 2 * r, x0, inside(y - 2 * r));
+            let (y2, y3) = (y - 2 * r, y - 3 * r);
+            if y2 >= top - r {
+                self.first_fit(job, y2, x0, inside(y2));
+                if y3 < top {
+                    self.begin_columns(y2, true);
+                }
             }
-            let y3 = y - 3 * r;
             if y3 >= top {
                 self.second_fit(job, y3, (x0, x1));
                 let from = (y3 - top) as usize * width;
@@ -288,6 +298,7 @@ impl Tile {
             return;
         }
         w0[PAD..PAD + x1 - x0].copy_from_slice(&job.start.row(y as usize)[x0..x1]);
+        prefetch(job, y as usize + 1, x0, x1);
         let words = self.words_at(y, job.radius);
         let left = image_rows(job.left, y);
         let mut out = Static {
@@ -316,14 +327,30 @@ impl Tile {
         product_row(job.level, self.ll.row(y), valid, self.len, self.ll_used.row_mut(y));
     }
 
+    /// Adds row `y` to the column sums of the first or second pass, whose window is not yet whole.
+    fn begin_columns(&mut self, y: isize, again: bool) {
+        let (first, second) = (&self.first, &self.second);
+        let (l, ll) = (&self.l_used, &self.ll_used);
+        let (columns, terms) = match again {
+            false => (&mut self.columns[..5], &[&first.valid, l, ll, &first.g, &first.gg][..]),
+            true => (&mut self.columns[5..], &[&second.g, &second.gg, &second.lg][..]),
+        };
+        for (column, ring) in columns.iter_mut().zip(terms) {
+            for (sum, v) in column.iter_mut().zip(ring.row(y)) {
+                *sum += v;
+            }
+        }
+    }
+
     /// Gain and offset, q, and horizontal moments of row `y`.
     fn normalise(&mut self, job: &Job<'_>, y: isize) {
         let (level, r, len) = (job.level, job.radius, self.len);
         let terms = [&self.first.valid, &self.l_used, &self.ll_used, &self.first.g, &self.first.gg];
-        for (ring, sum) in terms.into_iter().zip(&mut self.sums) {
-            around(ring, y, r, |rows| {
-                box_sum(level, rows, r, len, &mut self.column, sum.row_mut(y));
-            });
+        let ri = r as isize;
+        let columns = &mut self.columns[..5];
+        for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums).zip(columns) {
+            let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
+            slide_sum(level, (enters, leaves), r, len, column, sum.row_mut(y));
         }
         let [n, l, ll, g, gg] = &self.sums;
         let windowed =
@@ -403,10 +430,11 @@ impl Tile {
         let (level, r, len) = (job.level, job.radius, self.len);
         self.fits(job, y, x0, true, true);
         let terms = [&self.second.g, &self.second.gg, &self.second.lg];
-        for (ring, sum) in terms.into_iter().zip(&mut self.sums_again) {
-            around(ring, y, r, |rows| {
-                box_sum(level, rows, r, len, &mut self.column, sum.row_mut(y));
-            });
+        let ri = r as isize;
+        let columns = &mut self.columns[5..];
+        for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums_again).zip(columns) {
+            let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
+            slide_sum(level, (enters, leaves), r, len, column, sum.row_mut(y));
         }
         let ([n, l, ll, ..], [g, gg, lg]) = (&self.sums, &self.sums_again);
         let windowed =
@@ -458,6 +486,29 @@ impl Tile {
             });
         });
     }
+}
+
+/// Asks for the samples that the next row will need: twenty images are more streams than the
+/// processor follows by itself.
+fn prefetch(job: &Job<'_>, y: usize, x0: usize, x1: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if y < job.start.height() {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        let width = job.start.width() as isize;
+        // The right image's part lies about the mean disparity to the left.
+        for (images, shift) in [(job.left, 0), (job.right, job.origin as isize)] {
+            let from = (x0 as isize - shift).clamp(0, width) as usize;
+            let to = (x1 as isize - shift).clamp(0, width) as usize;
+            for image in &images[..job.frames] {
+                for line in image.row(y)[from..to].chunks(32) {
+                    // SAFETY: a hint about memory that the slice holds.
+                    unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
+                }
+            }
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (job, y, x0, x1);
 }
 
 /// Row `y` of each image.

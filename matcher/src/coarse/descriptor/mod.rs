@@ -58,14 +58,33 @@ fn tests(frames: usize) -> Vec<Test> {
     tests
 }
 
+/// Rows of a task.
+const BAND: usize = 32;
+
+/// A task's buffers.
+struct Scratch {
+    /// Sums over time of samples / 8.
+    light: Vec<i16>,
+    mean: Vec<i16>,
+    column: Vec<i32>,
+}
+
+impl Scratch {
+    fn new(width: usize, radius: usize) -> Self {
+        Self {
+            light: vec![0; width * (BAND + 2 * radius)],
+            mean: vec![0; width + BLOCK],
+            column: vec![0; width],
+        }
+    }
+}
+
 /// Descriptors of one image stack.
 #[derive(Debug, Default)]
 pub(crate) struct Descriptors {
     width: usize,
     stride: usize,
     data: Vec<u64>,
-    /// Sum over time of samples / 8.
-    light: Vec<i16>,
 }
 
 impl Descriptors {
@@ -85,28 +104,42 @@ impl Descriptors {
         self.width = width;
         self.stride = width.next_multiple_of(BLOCK) + 2 * MARGIN;
         self.data.resize(self.stride * height, OUTSIDE);
-        self.light.resize(width * height, 0);
         let tests = tests(images.len());
         // A window's mean over few frames needs more of its area.
         let radius = if images.len() < 4 { 4 } else { 2 };
-        self.light.par_chunks_mut(width * 16).enumerate().for_each(|(band, light)| {
-            for (i, light) in light.chunks_mut(width).enumerate() {
-                light.fill(0);
-                for image in images {
-                    add_eighth(level, image.row(band * 16 + i), light);
+        let stride = self.stride;
+        self.data.par_chunks_mut(stride * BAND).enumerate().for_each_init(
+            || Scratch::new(width, radius),
+            |scratch, (band, rows)| {
+                let Scratch { light, mean, column } = scratch;
+                // Sums over time of the band's rows and those its windows reach; rows beyond the
+                // image repeat the outermost one.
+                for (i, light) in light.chunks_mut(width).enumerate() {
+                    let y = (band * BAND + i).saturating_sub(radius).min(height - 1);
+                    light.fill(0);
+                    for image in images {
+                        add_eighth(level, image.row(y), light);
+                    }
                 }
-            }
-        });
-        let (light, stride) = (&self.light, self.stride);
-        self.data.par_chunks_mut(stride * 16).enumerate().for_each_init(
-            || (vec![0i16; width + BLOCK], vec![0i32; width]),
-            |(mean, column), (band, rows)| {
+                let side = 2 * radius + 1;
+                let scale = 8.0 / (side * side * images.len()) as f32;
                 for (i, row) in rows.chunks_mut(stride).enumerate() {
-                    let y = band * 16 + i;
-                    means(level, light, (width, height), y, radius, images.len(), column, mean);
+                    let mut window: [&[i16]; 9] = [&[]; 9];
+                    for (j, to) in window.iter_mut().enumerate().take(side) {
+                        *to = &light[(i + j) * width..][..width];
+                    }
+                    vectorised!(
+                        level,
+                        means_loop(
+                            rows: &[&[i16]] = &window[..side],
+                            scale: f32 = scale,
+                            column: &mut [i32] = column,
+                            mean: &mut [i16] = mean,
+                        )
+                    );
                     row[..MARGIN].fill(OUTSIDE);
                     row[MARGIN + width..].fill(OUTSIDE);
-                    describe_row(level, images, &tests, y, mean, &mut row[MARGIN..]);
+                    describe_row(level, images, &tests, band * BAND + i, mean, &mut row[MARGIN..]);
                 }
             },
         );
@@ -124,36 +157,8 @@ fn add_eighth_loop(row: &[Sample], light: &mut [i16]) {
     }
 }
 
-/// Mean of the window around each pixel of row `y`, in sample units; windows end at the image's
+/// Means over the windows of one row from sums over time, in sample units; windows end at the image's
 /// sides by repeating the outermost pixel.
-#[allow(clippy::too_many_arguments)]
-fn means(
-    level: Level,
-    light: &[i16],
-    (width, height): (usize, usize),
-    y: usize,
-    radius: usize,
-    frames: usize,
-    column: &mut [i32],
-    mean: &mut [i16],
-) {
-    let rows: [&[i16]; 9] = std::array::from_fn(|j| {
-        let row = (y + j.min(2 * radius)).saturating_sub(radius).min(height - 1);
-        &light[row * width..][..width]
-    });
-    let side = 2 * radius + 1;
-    let scale = 8.0 / (side * side * frames) as f32;
-    vectorised!(
-        level,
-        means_loop(
-            rows: &[&[i16]] = &rows[..side],
-            scale: f32 = scale,
-            column: &mut [i32] = column,
-            mean: &mut [i16] = mean,
-        )
-    );
-}
-
 #[inline(always)]
 fn means_loop(rows: &[&[i16]], scale: f32, column: &mut [i32], mean: &mut [i16]) {
     let width = column.len();

@@ -2,19 +2,18 @@
 
 use std::arch::x86_64::*;
 
-use super::Static;
+use super::{SQUARE_SHIFT, Static};
 use crate::{Sample, dense::kernels::Kernels};
 
 /// # Safety
-/// The processor has AVX2; `x0 + from - 3 .. x0 + from + 16 * blocks + 3` lies within every row and
-/// `from + 16 * blocks` within `out`.
+/// The processor has the features; for each block `at`, its pixels lie within `out`, and within
+/// every row with 3 samples on both sides.
 #[target_feature(enable = "avx2")]
 pub(super) unsafe fn blocks(
     kernels: &Kernels,
     left: &[&[Sample]],
     x0: usize,
-    from: usize,
-    blocks: usize,
+    blocks: impl Iterator<Item = usize>,
     out: &mut Static<'_>,
 ) {
     let c = [
@@ -24,8 +23,7 @@ pub(super) unsafe fn blocks(
     ];
     let quarter = _mm256_set1_epi16(8192);
     let ones = _mm256_set1_epi16(1);
-    for block in 0..blocks {
-        let at = from + block * 16;
+    for at in blocks {
         let zero = _mm256_setzero_si256();
         let mut sums = [[zero; 5]; 2];
         for (pair, rows) in left.chunks_exact(2).enumerate() {
@@ -65,9 +63,11 @@ pub(super) unsafe fn blocks(
                 s[4] = _mm256_add_epi32(s[4], _mm256_madd_epi16(l, l));
             }
         }
-        for (half, s) in sums.iter().enumerate() {
+        for (half, s) in sums.iter_mut().enumerate() {
+            let rounding = _mm256_set1_epi32(1 << (SQUARE_SHIFT - 1));
+            s[4] = _mm256_srai_epi32::<{ SQUARE_SHIFT as i32 }>(_mm256_add_epi32(s[4], rounding));
             let maps = [&mut *out.s, &mut *out.il, &mut *out.i, &mut *out.l, &mut *out.ll];
-            for (map, &s) in maps.into_iter().zip(s) {
+            for (map, s) in maps.into_iter().zip(*s) {
                 // SAFETY: `at + 16` lies within every map.
                 unsafe {
                     let to = map.as_mut_ptr().add(at + half * 8);

@@ -15,6 +15,12 @@ mod avx512;
 use super::kernels::Kernels;
 use crate::{Level, Sample};
 
+/// Unit of squared grey values: coarse enough that a window's column of them sums without rounding
+/// in an `f32`, whatever the order, and fine against any noise.
+pub(crate) const SQUARE_UNIT: f32 = 256.0;
+/// [`SQUARE_UNIT`] as a shift.
+pub(crate) const SQUARE_SHIFT: u32 = 8;
+
 /// Reach of the gradient's kernel on both sides.
 pub(crate) const REACH: usize = 3;
 
@@ -34,7 +40,7 @@ pub(crate) struct Static<'a> {
     pub i: &'a mut [f32],
     /// Sum over time of the grey value.
     pub l: &'a mut [f32],
-    /// Sum over time of the squared grey value.
+    /// Sum over time of the squared grey value, in units of [`SQUARE_UNIT`].
     pub ll: &'a mut [f32],
 }
 
@@ -67,20 +73,25 @@ pub(crate) fn static_row(
     // Whole blocks whose kernel stays inside the image, counted from `from`.
     let from = REACH.saturating_sub(x0).min(len);
     let end = width.saturating_sub(REACH).saturating_sub(x0).min(len);
-    let blocks = end.saturating_sub(from) / block;
-    let to = from + blocks * block;
+    if end < from + block {
+        return scalar::pixels(kernels, left, x0, 0..len, out);
+    }
     scalar::pixels(kernels, left, x0, 0..from, out);
+    let blocks = (end - from).div_ceil(block);
+    // The last block ends at `end` and may repeat pixels of the one before.
+    let at = |b: usize| if b + 1 == blocks { end - block } else { from + b * block };
+    let at = (0..blocks).map(at);
     match level {
         // SAFETY: trusted levels are the processor's; blocks lie within rows and outputs as checked
         // above, with REACH samples on both sides.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { avx512::blocks(kernels, left, x0, from, blocks, out) },
+        Level::Avx512 => unsafe { avx512::blocks(kernels, left, x0, at, out) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx2 => unsafe { avx2::blocks(kernels, left, x0, from, blocks, out) },
+        Level::Avx2 => unsafe { avx2::blocks(kernels, left, x0, at, out) },
         _ => {}
     }
-    scalar::pixels(kernels, left, x0, to..len, out);
+    scalar::pixels(kernels, left, x0, end..len, out);
 }
 
 #[cfg(test)]

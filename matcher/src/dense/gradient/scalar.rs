@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::{REACH, Static};
+use super::{REACH, SQUARE_SHIFT, Static};
 use crate::{Sample, dense::kernels::Kernels};
 
 /// Rounded product of fractions in 1/2^15, as `pmulhrsw` and `sqrdmulh` give it.
@@ -21,6 +21,16 @@ pub(super) fn pixels(
     let width = left[0].len();
     for at in range {
         let x = x0 + at;
+        if x >= width {
+            for pair in 0..left.len() / 2 {
+                out.gradient[pair * out.stride + at] = 0;
+                out.grey[pair * out.stride + at] = 0;
+            }
+            for map in [&mut out.s, &mut out.il, &mut out.i, &mut out.l, &mut out.ll] {
+                map[at] = 0.0;
+            }
+            continue;
+        }
         let (mut s, mut il, mut i1, mut l1, mut ll) = (0i32, 0i32, 0i32, 0i32, 0i32);
         for (pair, rows) in left.chunks_exact(2).enumerate() {
             let mut both = [(0i16, 0i16); 2];
@@ -47,6 +57,6 @@ pub(super) fn pixels(
         out.il[at] = il as f32;
         out.i[at] = i1 as f32;
         out.l[at] = l1 as f32;
-        out.ll[at] = ll as f32;
+        out.ll[at] = (ll.wrapping_add(1 << (SQUARE_SHIFT - 1)) >> SQUARE_SHIFT) as f32;
     }
 }

@@ -3,7 +3,7 @@
 use std::arch::x86_64::*;
 
 use super::{Source, Warped, position};
-use crate::dense::kernels::Kernels;
+use crate::dense::{gradient::SQUARE_SHIFT, kernels::Kernels};
 
 /// Does whole blocks, and returns the number of pixels done.
 ///
@@ -72,12 +72,16 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             gg = _mm256_add_epi32(gg, _mm256_madd_epi16(g, g));
         }
         let float = |v| _mm256_cvtepi32_ps(_mm256_and_si256(v, mask));
+        let square = |v| {
+            let rounded = _mm256_add_epi32(v, _mm256_set1_epi32(1 << (SQUARE_SHIFT - 1)));
+            float(_mm256_srai_epi32::<{ SQUARE_SHIFT as i32 }>(rounded))
+        };
         // SAFETY: `i + 8` lies within every map.
         unsafe {
             _mm256_storeu_ps(out.ig.as_mut_ptr().add(i), float(ig));
             _mm256_storeu_ps(out.g.as_mut_ptr().add(i), float(g1));
-            _mm256_storeu_ps(out.gg.as_mut_ptr().add(i), float(gg));
-            _mm256_storeu_ps(out.lg.as_mut_ptr().add(i), float(lg));
+            _mm256_storeu_ps(out.gg.as_mut_ptr().add(i), square(gg));
+            _mm256_storeu_ps(out.lg.as_mut_ptr().add(i), square(lg));
         }
     }
     blocks * 8

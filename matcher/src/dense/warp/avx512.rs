@@ -7,7 +7,15 @@
 use std::arch::x86_64::*;
 
 use super::{Source, Warped};
-use crate::dense::kernels::Kernels;
+use crate::dense::{gradient::SQUARE_SHIFT, kernels::Kernels};
+
+/// Sums of squares in their unit.
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn square(sum: __m512i) -> __m512 {
+    let rounded = _mm512_add_epi32(sum, _mm512_set1_epi32(1 << (SQUARE_SHIFT - 1)));
+    _mm512_cvtepi32_ps(_mm512_srai_epi32::<SQUARE_SHIFT>(rounded))
+}
 
 /// Blocks whose windows are placed at a time.
 const AHEAD: usize = 32;
@@ -141,8 +149,8 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             _mm512_storeu_ps(out.valid.as_mut_ptr().add(i), one);
             _mm512_storeu_ps(out.ig.as_mut_ptr().add(i), _mm512_cvtepi32_ps(ig));
             _mm512_storeu_ps(out.g.as_mut_ptr().add(i), _mm512_cvtepi32_ps(g1));
-            _mm512_storeu_ps(out.gg.as_mut_ptr().add(i), _mm512_cvtepi32_ps(gg));
-            _mm512_storeu_ps(out.lg.as_mut_ptr().add(i), _mm512_cvtepi32_ps(lg));
+            _mm512_storeu_ps(out.gg.as_mut_ptr().add(i), square(gg));
+            _mm512_storeu_ps(out.lg.as_mut_ptr().add(i), square(lg));
         }
     }
     blocks * 16

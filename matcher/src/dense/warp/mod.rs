@@ -41,9 +41,9 @@ pub(crate) struct Warped<'a> {
     pub ig: &'a mut [f32],
     /// Sum over time of the right grey value.
     pub g: &'a mut [f32],
-    /// Sum over time of the squared right grey value.
+    /// Sum over time of the squared right grey value, in [`super::gradient::SQUARE_UNIT`].
     pub gg: &'a mut [f32],
-    /// Sum over time of left times right grey value.
+    /// Sum over time of left times right grey value, in the same unit.
     pub lg: &'a mut [f32],
 }
 
@@ -142,7 +142,7 @@ mod tests {
         let out = run(Level::Scalar, &[row, vec![0; 80]], 0, &w);
         for x in 10..70 {
             let want = f(x as f64 - f64::from(w[x])) / 4.0;
-            assert!((f64::from(out[3][x]) - want).abs() < 8.0, "{x} {} {want}", out[3][x]);
+            assert!((f64::from(out[3][x]) - want).abs() < 12.0, "{x} {} {want}", out[3][x]);
         }
     }
 }

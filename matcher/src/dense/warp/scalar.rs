@@ -3,7 +3,11 @@
 use std::ops::Range;
 
 use super::{Source, Warped, position};
-use crate::dense::kernels::Kernels;
+use crate::dense::{gradient::SQUARE_SHIFT, kernels::Kernels};
+
+fn square(sum: i32) -> f32 {
+    (sum.wrapping_add(1 << (SQUARE_SHIFT - 1)) >> SQUARE_SHIFT) as f32
+}
 
 pub(super) fn pixels(
     kernels: &Kernels,
@@ -39,7 +43,7 @@ pub(super) fn pixels(
         out.valid[i] = if place.is_some() { 1.0 } else { 0.0 };
         out.ig[i] = ig as f32;
         out.g[i] = g1 as f32;
-        out.gg[i] = gg as f32;
-        out.lg[i] = lg as f32;
+        out.gg[i] = square(gg);
+        out.lg[i] = square(lg);
     }
 }
