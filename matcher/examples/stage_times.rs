@@ -5,7 +5,8 @@
 use stspp_matcher::{
     DisparityRange, Image, Level, ShapeFunction,
     coarse::{Coarse, CoarseMap, INVALID},
-    dense::{DenseFit, DenseMaps, mark_steps},
+    dense::{DenseFit, DenseMaps, mark_steps, order::OrderChoice},
+    regions::Regions,
     synthetic::Scene,
 };
 
@@ -31,7 +32,12 @@ fn main() {
     let mut maps = DenseMaps::new(w, h);
     let mut first = DenseFit::new(level, 4, ShapeFunction::First, 1.5);
     let mut auto = DenseFit::new(level, 4, ShapeFunction::Auto, 1.5);
-    let mut best = [f64::INFINITY; 6];
+    let mut order = OrderChoice::default();
+    let mut regions = Regions::default();
+    let mut disparity = Image::new(w, h, f32::NAN);
+    let names =
+        ["describe", "search", "start and steps", "dense first", "dense", "order", "regions"];
+    let mut best = [f64::INFINITY; 7];
     r.with_stack(|s| {
         for _ in 0..repeats {
             let mut t = cpu_ms();
@@ -42,24 +48,29 @@ fn main() {
             };
             coarse.describe(s);
             lap(0);
-            coarse.search(s, false, &mut map);
-            lap(1);
             coarse.search(s, true, &mut map);
-            lap(2);
+            lap(1);
             for (to, d) in start.as_mut_slice().iter_mut().zip(map.disparity.as_slice()) {
                 *to = if *d == INVALID { f32::NAN } else { f32::from(*d) };
             }
             mark_steps(level, &start, 4, 1.5, &mut step);
-            lap(3);
+            lap(2);
             first.fit(s, &start, &step, &mut maps);
-            lap(4);
+            lap(3);
             auto.fit(s, &start, &step, &mut maps);
+            lap(4);
+            order.choose(level, 0.8, &mut maps, &mut disparity);
             lap(5);
+            regions.remove(&mut disparity, 60);
+            lap(6);
         }
     });
     let flagged = step.as_slice().iter().filter(|v| **v != 0).count();
-    println!(
-        "{level} {threads} threads, CPU ms: describe {:.2} search {:.2} cleaned search {:.2} steps {:.2} first {:.2} both {:.2}; {flagged} flagged",
-        best[0], best[1], best[2], best[3], best[4], best[5]
-    );
+    println!("{level}, {threads} threads, CPU ms, {flagged} pixels at steps:");
+    for (name, ms) in names.iter().zip(best) {
+        println!("  {name:16} {ms:6.2}");
+    }
+    let sum = |with: &[usize]| with.iter().map(|&i| best[i]).sum::<f64>();
+    println!("  frame, first     {:6.2}", sum(&[0, 1, 2, 3, 6]));
+    println!("  frame, auto      {:6.2}", sum(&[0, 1, 2, 4, 5, 6]));
 }

@@ -15,14 +15,15 @@ pub const PHASES: usize = 16;
 pub const TAPS: usize = 8;
 /// Unit of an interpolation coefficient.
 pub const COEFFICIENT_ONE: i32 = 1 << 14;
-/// Dots that the design is for: the sharpest that the sensor's optics give.
-const DESIGN_SIGMA_PX: f64 = 0.75;
+/// Dots that the design is for: small ones, blur included. Sharper ones are served by the bias
+/// terms.
+const DESIGN_SIGMA_PX: f64 = 1.1;
 /// Dot sizes at which the interpolation's shift bias is kept small.
 const UNBIASED_SIGMA_PX: [f64; 5] = [0.75, 0.85, 1.0, 1.2, 1.4];
 /// Weight of the squared bias against the integrated squared error.
-const BIAS_WEIGHT: f64 = 1e4;
+const BIAS_WEIGHT: f64 = 5e3;
 /// Weight of frequencies that no dot has, so that noise is not amplified.
-const FLOOR: f64 = 1e-4;
+const FLOOR: f64 = 1e-6;
 /// Nodes of the integral over frequency.
 const NODES: usize = 512;
 
@@ -73,8 +74,13 @@ fn weight(omega: f64) -> f64 {
 
 /// Frequencies up to twice Nyquist's: a small dot's spectrum reaches beyond pi, and what is folded
 /// back counts in the bias.
-fn nodes() -> impl Iterator<Item = f64> {
+fn folded_nodes() -> impl Iterator<Item = f64> {
     (0..NODES).map(|i| (i as f64 + 0.5) * std::f64::consts::TAU / NODES as f64)
+}
+
+/// Frequencies up to Nyquist's.
+fn nodes() -> impl Iterator<Item = f64> {
+    folded_nodes().take(NODES / 2)
 }
 
 /// Smallest c^T A c - 2 b^T c with g^T c = 1.
@@ -103,9 +109,10 @@ fn interpolation_taps(tau: f64) -> Vec<f64> {
     });
     for sigma in UNBIASED_SIGMA_PX {
         let power = |o: f64| (-(o * sigma).powi(2)).exp();
-        let energy: f64 = nodes().map(|o| o * o * power(o)).sum();
+        let energy: f64 = folded_nodes().map(|o| o * o * power(o)).sum();
         let bias = DVector::from_fn(TAPS, |k, _| {
-            nodes().map(|o| power(o) * o * (o * (offset(k) - tau)).sin()).sum::<f64>() / energy
+            folded_nodes().map(|o| power(o) * o * (o * (offset(k) - tau)).sin()).sum::<f64>()
+                / energy
         });
         a += &bias * bias.transpose() * BIAS_WEIGHT;
     }

@@ -20,8 +20,6 @@ pub mod order;
 pub(crate) mod refit;
 pub(crate) mod solve;
 pub(crate) mod tile;
-#[cfg(test)]
-mod timing;
 pub(crate) mod warp;
 
 use std::sync::Mutex;
@@ -36,8 +34,8 @@ use tile::{Job, Output, Tile};
 
 /// Columns a tile fits: its rows stay in a core's second-level cache.
 const STRIP: usize = 640;
-/// Rows of a task.
-const BAND: usize = 128;
+/// Fewest rows of a task: each computes some rows beyond its own anew.
+const BAND: usize = 64;
 
 /// The dense fit; keeps its buffers between frames.
 #[derive(Debug)]
@@ -119,7 +117,9 @@ impl DenseFit {
             origin: origin(start),
         };
         let tiles = &self.tiles;
-        let rows = width * BAND;
+        // Results do not depend on where bands end.
+        let band_rows = height.div_ceil(2 * threads).max(BAND);
+        let rows = width * band_rows;
         let DenseMaps { first_px, second_px, zncc } = out;
         first_px
             .as_mut_slice()
@@ -134,7 +134,7 @@ impl DenseFit {
                 let strips = width.div_ceil(STRIP);
                 for strip in 0..strips {
                     let columns = (width * strip / strips, width * (strip + 1) / strips);
-                    tile.run(&job, columns, band * BAND, &mut out);
+                    tile.run(&job, columns, band * band_rows, &mut out);
                 }
             });
     }
@@ -150,8 +150,8 @@ fn origin(start: &Image<f32>) -> f32 {
     if n == 0 { 0.0 } else { (sum / f64::from(n)).round() as f32 }
 }
 
-/// Marks the pixels whose window of `radius` holds a valid disparity more than `limit` px from their
-/// own.
+/// Marks the pixels whose window of `radius` holds a depth step: a disparity more than `limit` px from
+/// their own, and a jump of that size between neighbours, or a gap. A steep surface has no jump.
 pub fn mark_steps(
     level: Level,
     start: &Image<f32>,
@@ -167,8 +167,11 @@ pub fn mark_steps(
     }
     let data = out.as_mut_slice();
     data.par_chunks_mut((width * 32).max(1)).enumerate().for_each_init(
-        || [vec![f32::INFINITY; width + 2 * radius], vec![f32::NEG_INFINITY; width + 2 * radius]],
-        |[low, high], (band, marks)| {
+        || {
+            let row = |v: f32| vec![v; width + 2 * radius];
+            [row(f32::INFINITY), row(f32::NEG_INFINITY), row(0.0), row(0.0)]
+        },
+        |[low, high, jumps, wide], (band, marks)| {
             for (i, marks) in marks.chunks_mut(width).enumerate() {
                 let y = band * 32 + i;
                 let (top, end) = (y.saturating_sub(radius), (y + radius + 1).min(height));
@@ -184,6 +187,8 @@ pub fn mark_steps(
                         limit: f32 = limit,
                         low: &mut [f32] = low,
                         high: &mut [f32] = high,
+                        jumps: &mut [f32] = jumps,
+                        wide: &mut [f32] = wide,
                         marks: &mut [u8] = marks,
                     )
                 );
@@ -194,12 +199,15 @@ pub fn mark_steps(
 
 /// `low` and `high` hold the column extremes, with neutral values beyond the image's sides.
 #[inline(always)]
+#[allow(clippy::too_many_arguments)]
 fn mark_row(
     rows: &[&[f32]],
     own: &[f32],
     limit: f32,
     low: &mut [f32],
     high: &mut [f32],
+    jumps: &mut [f32],
+    wide: &mut [f32],
     marks: &mut [u8],
 ) {
     let width = own.len();
@@ -214,11 +222,33 @@ fn mark_row(
             *hi = if v > *hi { v } else { *hi };
         }
     }
+    // One where a neighbour in the row or below is far or missing.
+    let column = &mut jumps[radius..][..width];
+    column.fill(0.0);
+    for (i, row) in rows.iter().enumerate() {
+        let below = rows[(i + 1).min(rows.len() - 1)];
+        for (((jump, &v), &right), &below) in
+            column.iter_mut().zip(*row).zip(row.iter().skip(1)).zip(below)
+        {
+            let near = (right - v).abs() <= limit && (below - v).abs() <= limit;
+            *jump = if near { *jump } else { 1.0 };
+        }
+    }
+    let jump = &mut wide[..width];
+    jump.fill(0.0);
+    for j in 0..2 * radius + 1 {
+        for (to, &v) in jump.iter_mut().zip(&jumps[j..j + width]) {
+            *to = if v > *to { v } else { *to };
+        }
+    }
     marks.fill(0);
     for j in 0..2 * radius + 1 {
         let window = low[j..j + width].iter().zip(&high[j..j + width]);
         for ((mark, &own), (&lo, &hi)) in marks.iter_mut().zip(own).zip(window) {
             *mark |= u8::from(own - lo > limit) | u8::from(hi - own > limit);
         }
+    }
+    for (mark, &jump) in marks.iter_mut().zip(jump.iter()) {
+        *mark &= u8::from(jump > 0.5);
     }
 }

@@ -4,8 +4,9 @@
 //! ```text
 //! y      gradients and sums of the left row, warp at the start w0
 //! y - r  gain and offset, q, horizontal moments of q and S
-//! y - 2r M^-1, first fit w1, warp at w1, q again with moments
-//! y - 3r second fit, ZNCC
+//! y - 2r M^-1, first fit w1, warp at w1
+//! y - 3r gain and offset, q, moments again; ZNCC
+//! y - 4r second fit
 //! ```
 
 use super::{
@@ -129,6 +130,7 @@ pub(crate) struct Tile {
     l_used: Ring,
     ll_used: Ring,
     first: Pass,
+    /// Gain and offset of the row in work.
     ratio: Ring,
     offset: Ring,
     s_used: Ring,
@@ -200,13 +202,13 @@ impl Tile {
         }
         self.flagged.resize(len, 0.0);
         self.powers = powers(radius);
-        for ring in [&mut self.w0, &mut self.s_used] {
+        for ring in [&mut self.w0, &mut self.il, &mut self.i, &mut self.w1] {
             ring.resize(stride, 3 * radius + 1);
         }
-        for ring in [&mut self.s, &mut self.il, &mut self.i, &mut self.l, &mut self.ll] {
+        self.s_used.resize(stride, 4 * radius + 1);
+        for ring in [&mut self.s, &mut self.l, &mut self.ll] {
             ring.resize(stride, window);
         }
-        self.w1.resize(stride, window);
         // Window sums slide: the row that leaves is one behind the window.
         for ring in [&mut self.l_used, &mut self.ll_used] {
             ring.resize(stride, window + 1);
@@ -214,12 +216,15 @@ impl Tile {
         for ring in self.hs.iter_mut().chain(&mut self.sums) {
             ring.resize(stride, window);
         }
-        for ring in [&mut self.ratio, &mut self.offset].into_iter().chain(&mut self.inverse) {
-            ring.resize(stride, radius + 1);
+        for ring in [&mut self.ratio, &mut self.offset] {
+            ring.resize(stride, 1);
+        }
+        for ring in &mut self.inverse {
+            ring.resize(stride, window);
         }
         self.first.resize(stride, window);
         self.second.resize(stride, window);
-        self.zncc.resize(stride, 1);
+        self.zncc.resize(stride, radius + 1);
         for ring in self.sums_again.iter_mut().chain(&mut self.fit) {
             ring.resize(stride, 1);
         }
@@ -237,30 +242,33 @@ impl Tile {
         let (width, height) = (job.start.width(), job.start.height());
         let rows = out.first.len() / width;
         let r = job.radius as isize;
-        let halo = 3 * job.radius;
+        let halo = 4 * job.radius;
         let x0 = x_from.saturating_sub(halo);
         let x1 = (x_to + halo).min(width);
         let len = (x1 - x0).next_multiple_of(32);
         self.resize(len, job.radius, job.left.len() / 2);
         let (top, end) = (y_from as isize, (y_from + rows) as isize);
         let inside = |y: isize| (0..height as isize).contains(&y);
-        for y in top - 3 * r..end + 3 * r {
+        for y in top - 4 * r..end + 4 * r {
             self.enter(job, y, (x0, x1), inside(y));
-            if y - r >= top - 2 * r {
+            if y - r >= top - 3 * r {
                 self.normalise(job, y - r);
             } else {
                 self.begin_columns(y, false);
             }
-            let (y2, y3) = (y - 2 * r, y - 3 * r);
-            if y2 >= top - r {
+            let (y2, y3, y4) = (y - 2 * r, y - 3 * r, y - 4 * r);
+            if y2 >= top - 2 * r {
                 self.first_fit(job, y2, x0, inside(y2));
-                if y3 < top {
+                if y3 < top - r {
                     self.begin_columns(y2, true);
                 }
             }
-            if y3 >= top {
-                self.second_fit(job, y3, (x0, x1));
-                let from = (y3 - top) as usize * width;
+            if y3 >= top - r {
+                self.normalise_again(job, y3);
+            }
+            if y4 >= top {
+                self.second_fit(job, y4, (x0, x1));
+                let from = (y4 - top) as usize * width;
                 let columns = x_from - x0 + PAD..x_to - x0 + PAD;
                 let maps = [
                     (&mut *out.first, &self.fit[0], job.origin),
@@ -268,7 +276,7 @@ impl Tile {
                     (&mut *out.zncc, &self.zncc, 0.0),
                 ];
                 for (to, ring, origin) in maps {
-                    let values = &ring.row(y3)[columns.clone()];
+                    let values = &ring.row(y4)[columns.clone()];
                     for (to, v) in to[from + x_from..from + x_to].iter_mut().zip(values) {
                         *to = v + origin;
                     }
@@ -386,7 +394,7 @@ impl Tile {
             w: w.row(y),
             // A coarse start has whole pixels: its slope needs a wider base.
             base: if again { 2 } else { 4 },
-            step: if again { 1.5 } else { 3.5 },
+            step: if again { 3.0 } else { 5.0 },
             origin: job.origin,
         };
         residual_row(job.level, &terms, self.len, pass.q.row_mut(y));
@@ -422,13 +430,12 @@ impl Tile {
             };
             warp_row(level, &source, &mut self.second.warped(y));
         }
-        self.residual(job, y, true);
     }
 
-    /// The second fit of row `y`, and its ZNCC.
-    fn second_fit(&mut self, job: &Job<'_>, y: isize, (x0, x1): (usize, usize)) {
+    /// Gain and offset, q, horizontal moments and ZNCC of row `y` from the second warp: the first
+    /// one, at whole pixels, leaves the gain uncertain by a part in a hundred.
+    fn normalise_again(&mut self, job: &Job<'_>, y: isize) {
         let (level, r, len) = (job.level, job.radius, self.len);
-        self.fits(job, y, x0, true, true);
         let terms = [&self.second.g, &self.second.gg, &self.second.lg];
         let ri = r as isize;
         let columns = &mut self.columns[5..];
@@ -439,7 +446,15 @@ impl Tile {
         let ([n, l, ll, ..], [g, gg, lg]) = (&self.sums, &self.sums_again);
         let windowed =
             Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
+        let (ratio, offset) = (self.ratio.row_mut(y), self.offset.row_mut(y));
+        gain_row(level, &windowed, job.frames, len, ratio, offset);
         zncc_row(level, &windowed, lg.row(y), job.frames, len, self.zncc.row_mut(y));
+        self.residual(job, y, true);
+    }
+
+    /// The second fit of row `y`, and its ZNCC.
+    fn second_fit(&mut self, job: &Job<'_>, y: isize, (x0, x1): (usize, usize)) {
+        self.fits(job, y, x0, true, true);
         // Only pixels with a start and a warp of their own are measured.
         let valid = &self.second.valid.row(y)[PAD..PAD + x1 - x0];
         for ring in self.fit.iter_mut().chain([&mut self.zncc]) {
