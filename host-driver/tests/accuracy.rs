@@ -1,0 +1,47 @@
+//! The accuracy tables on a small simulated sensor: what they say must follow from the physics.
+#![cfg(feature = "sim")]
+
+use stspp::accuracy::maps;
+use stspp::accuracy::tables::{Case, Setting, to_text};
+use stspp_hil_sim::world::{SceneSpec, SensorModel};
+use stspp_matcher::Method;
+
+fn case(scene: &str, options: &[(&str, &str)], frames: usize) -> Case {
+    let spec = SceneSpec::parse(scene, options).unwrap();
+    Case::new(&spec, SensorModel::default().scaled_down(2), frames, &mut |_| {}).unwrap()
+}
+
+#[test]
+fn refinement_and_more_frames_bring_accuracy() {
+    let case = case("sphere", &[], 6);
+    let icgn = Setting { method: Method::IcGn, ..Setting::default() };
+    let parabola = Setting { method: Method::Parabola, ..Setting::default() };
+    let (few, _) = case.line("sphere", 2, icgn).unwrap();
+    let (many, frame) = case.line("sphere", 6, icgn).unwrap();
+    let (coarse, _) = case.line("sphere", 6, parabola).unwrap();
+    println!("{}", to_text(&[few.clone(), many.clone(), coarse.clone()]));
+    // Half the resolution: a pixel of disparity is twice as deep as the sensor's.
+    assert!(many.core_rms_mm.unwrap() < 0.1, "{many:?}");
+    assert!(many.core_rms_mm < few.core_rms_mm, "{few:?} {many:?}");
+    assert!(many.core_rms_mm.unwrap() < 0.5 * coarse.core_rms_mm.unwrap(), "{coarse:?}");
+    assert!(many.core_radius_error_mm.unwrap().abs() < 0.1, "{many:?}");
+    assert!(many.score.completeness > 0.97 && many.score.outliers < 0.003, "{many:?}");
+    assert!(many.score.surface_median_mm < many.score.surface_rms_mm);
+    // The truth is of the canvas: a frame made of it has no error at all.
+    let mut exact = frame.clone();
+    exact.depth_m = case.truth().depth_m.clone();
+    let perfect = stspp::accuracy::score::score(&exact, case.truth());
+    assert_eq!((perfect.completeness, perfect.outliers, perfect.surface_rms_mm), (1.0, 0.0, 0.0));
+    // Errors are seen, wherever they are.
+    let (x, y) = (exact.depth_m.width() / 2, exact.depth_m.height() / 2);
+    exact.depth_m.set(x, y, 0.5);
+    exact.depth_m.set(x + 1, y, f32::NAN);
+    let spoilt = stspp::accuracy::score::score(&exact, case.truth());
+    assert!((spoilt.outliers * spoilt.points as f64 - 1.0).abs() < 1e-6);
+    assert!(
+        (spoilt.completeness * spoilt.visible as f64 - (spoilt.visible as f64 - 2.0)).abs() < 1e-6
+    );
+    let mut picture = Vec::new();
+    maps::write_error_png(&mut picture, &exact, case.truth(), 0.1).unwrap();
+    assert!(picture.starts_with(b"\x89PNG"));
+}
