@@ -1,8 +1,8 @@
 //! Spatio-temporal speckle matching of rectified stereo stacks.
 //!
 //! Data flow: a [`StereoStack`] of N rectified pairs goes through census, Hamming cost, winner takes
-//! all, parabola, reliability retry, left-right check, sub-pixel refinement by Stereo-DIC, and comes
-//! out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
+//! all, parabola, reliability retry, left-right check, sub-pixel refinement by Stereo-DIC, growth into
+//! the gaps, and comes out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
 
 pub mod bspline;
 pub mod census;
