@@ -34,7 +34,6 @@ fn flash_and_ram_stay_within_their_budgets() {
             trigger_delay_us: 20,
             gate_lead_us: 10,
             gate_lag_us: 10,
-            ..ProjectionTiming::default()
         };
         light_up(&mut session, &full).unwrap();
         for _ in 0..50 {
