@@ -167,12 +167,13 @@ impl GateEngine for Engine {
                 guard::disarm();
                 return;
             }
-            let on_us = Instant::now().as_micros() + FLOODLIGHT_LEAD_US;
             let edge = |at_us, gates| Edge {
                 at_us,
                 effect: Effect { gates: Some(gates), triggers: None },
             };
             core.queue.restart();
+            // After the restart, which clears both rings and takes a good part of the lead.
+            let on_us = Instant::now().as_micros() + FLOODLIGHT_LEAD_US;
             // Refused only where this was stalled for longer than the lead: then it stays dark,
             // which the controller finds at the end of the pulse.
             let _ = core.queue.queue(&[
