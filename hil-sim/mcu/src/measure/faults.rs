@@ -215,7 +215,14 @@ pub fn light_up(
     session.call(Request::ClearFaults(ClearFaults))?;
     session.call(Request::SetTiming(SetTiming { timing: timing.clone() }))?;
     session.call(Request::Arm(Arm))?;
-    session.call(Request::StartStream(StartStream))?;
+    // After a reset the emitters count as hot: the duty budget asks for a rest.
+    while let Err(error) = session.call(Request::StartStream(StartStream)) {
+        let CallError::Refused(RequestError::DutyBudget { retry_after_us, .. }) = error else {
+            return Err(error);
+        };
+        session.run_for(u64::from(retry_after_us).clamp(1_000, 200_000) * 1_000);
+        session.call(Request::Heartbeat(Heartbeat))?;
+    }
     for _ in 0..400 {
         session.run_for(500_000);
         if session.controller.light_is_on() {
