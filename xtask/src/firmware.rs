@@ -22,8 +22,9 @@ const FLASH_BUDGET: u64 = 64 * 1024;
 /// Static RAM and the stack's high-water mark together. What is printed here is the static part;
 /// the emulator's tests add the measured stack.
 const RAM_BUDGET: u64 = 14 * 1024;
-/// Least room for the stack that the static part must leave of [`RAM_BUDGET`].
-const STACK_LEAST: u64 = 3 * 1024;
+/// Least room for the stack that the static part must leave of [`RAM_BUDGET`]: the high-water mark
+/// that the emulator measured (5.7 KiB on the F330, 5.8 KiB on the F350), rounded up.
+const STACK_LEAST: u64 = 6 * 1024;
 
 /// The boards, as the feature `board-<name>` of firmware/app names them.
 pub const BOARDS: [&str; 2] = ["f330", "f350"];
