@@ -23,12 +23,13 @@ fn run(scene: &Rendered, params: Params) -> Matched {
     scene.with_stack(|stack| matcher.match_stack(stack)).unwrap()
 }
 
-/// Errors where the map is valid and at least `margin` px inside.
+/// Errors where the map is valid and at least `margin` px inside, 40 more on the left: there the
+/// right image ends.
 fn errors(map: &Image<f32>, truth: &Image<f32>, margin: usize) -> Vec<f64> {
     let (w, h) = (map.width(), map.height());
     let inside = |i: &usize| {
         let (x, y) = (i % w, i / w);
-        x >= margin && x + margin < w && y >= margin && y + margin < h
+        x >= margin + 40 && x + margin < w && y >= margin && y + margin < h
     };
     (0..w * h)
         .filter(inside)
@@ -43,7 +44,7 @@ fn rms(errors: &[f64]) -> f64 {
 
 fn slanted(noise: bool) -> Scene {
     let plane = |x: f64, y: f64| 21.3 + 0.11 * x - 0.07 * y;
-    let mut scene = Scene::new(150, 110, 10, vec![Layer::everywhere(plane)]);
+    let mut scene = Scene::new(200, 110, 10, vec![Layer::everywhere(plane)]);
     scene.noise = noise;
     // Nothing saturates: that would be an error of the scene, not of the estimate.
     scene.peak_dn = 70.0;
@@ -57,9 +58,9 @@ fn finds_a_slanted_plane_without_noise_and_without_bias() {
         let found = run(&scene, params(Method::Dense, shape));
         let errors = errors(&found.disparity_px, &scene.truth_px, 25);
         let mean = errors.iter().sum::<f64>() / errors.len() as f64;
-        assert!(errors.len() > 95 * 55, "{shape:?}: {} points", errors.len());
+        assert!(errors.len() > 105 * 55, "{shape:?}: {} points", errors.len());
         // What is left is the interpolation's error, which the second order averages less.
-        assert!(rms(&errors) < 4e-3 && mean.abs() < 5e-4, "{shape:?} {} {mean}", rms(&errors));
+        assert!(rms(&errors) < 1.5e-3 && mean.abs() < 5e-4, "{shape:?} {} {mean}", rms(&errors));
     }
 }
 
@@ -67,7 +68,7 @@ fn finds_a_slanted_plane_without_noise_and_without_bias() {
 #[test]
 fn equals_icgn() {
     let scene = slanted(true).render();
-    for (shape, most) in [(ShapeFunction::First, 3e-3), (ShapeFunction::Second, 6e-3)] {
+    for (shape, most) in [(ShapeFunction::First, 1.5e-3), (ShapeFunction::Second, 3e-3)] {
         let dense = run(&scene, params(Method::Dense, shape));
         let point = run(&scene, params(Method::IcGn, shape));
         let difference = errors(&dense.disparity_px, &point.disparity_px, 25);
@@ -75,9 +76,9 @@ fn equals_icgn() {
             rms(&errors(&dense.disparity_px, &scene.truth_px, 25)),
             rms(&errors(&point.disparity_px, &scene.truth_px, 25)),
         );
-        assert!(difference.len() > 95 * 55);
+        assert!(difference.len() > 105 * 55);
         assert!(rms(&difference) < most, "{shape:?} differs by {}", rms(&difference));
-        assert!(d < 1.12 * p, "{shape:?}: dense {d}, per point {p}");
+        assert!(d < 1.03 * p, "{shape:?}: dense {d}, per point {p}");
     }
 }
 
@@ -91,8 +92,8 @@ fn auto_takes_the_first_order_where_flat_and_the_second_where_curved() {
     let (first, auto) = (of(&flat, ShapeFunction::First), of(&flat, ShapeFunction::Auto));
     assert!(auto < 1.35 * first, "flat: first {first}, auto {auto}");
     // A cylinder: 0.5 x 0.006 x 4^2 px of bow within half a window.
-    let bow = |x: f64, _: f64| 30.0 - 0.003 * (x - 75.0).powi(2);
-    let curved = Scene::new(150, 110, 10, vec![Layer::everywhere(bow)]).render();
+    let bow = |x: f64, _: f64| 30.0 - 0.003 * (x - 110.0).powi(2);
+    let curved = Scene::new(200, 110, 10, vec![Layer::everywhere(bow)]).render();
     let [first, second, auto] =
         [ShapeFunction::First, ShapeFunction::Second, ShapeFunction::Auto].map(|s| of(&curved, s));
     assert!(second < first && auto < 1.3 * second, "curved: {first} {second} {auto}");
@@ -234,12 +235,12 @@ fn black_saturated_and_unequal_input_gives_nothing_or_an_error() {
 #[test]
 fn masked_pixels_are_invalid() {
     let scene = slanted(true).render();
-    let mut left_mask = Image::new(150, 110, 1u8);
+    let mut left_mask = Image::new(200, 110, 1u8);
     left_mask.row_mut(50).fill(0);
     let mut matcher = Matcher::new(params(Method::Dense, ShapeFunction::Second)).unwrap();
     let found = scene.with_stack(|stack| {
         matcher.match_stack(&StereoStack { left_mask: Some(&left_mask), ..*stack }).unwrap()
     });
     assert!(found.disparity_px.row(50).iter().all(|d| d.is_nan()));
-    assert!(found.disparity_px.row(52)[40..110].iter().all(|d| !d.is_nan()));
+    assert!(found.disparity_px.row(52)[60..150].iter().all(|d| !d.is_nan()));
 }

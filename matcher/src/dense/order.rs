@@ -84,11 +84,17 @@ impl OrderChoice {
             });
     }
 
-    /// Standard deviation of the difference, robustly: from the median of its magnitude.
+    /// Standard deviation of the difference, robustly: from the median change over a window's width,
+    /// in which curvature cancels.
     fn sigma(&mut self, maps: &DenseMaps) -> f32 {
+        let apart = 2 * RADIUS + 1;
+        let (first, second) = (maps.first_px.as_slice(), maps.second_px.as_slice());
+        let difference = |i: usize| second[i] - first[i];
         self.sample.clear();
-        let pairs = maps.first_px.as_slice().iter().zip(maps.second_px.as_slice());
-        self.sample.extend(pairs.step_by(97).map(|(a, b)| (a - b).abs()).filter(|d| !d.is_nan()));
+        let pairs = (0..first.len().saturating_sub(apart)).step_by(97);
+        let changes = pairs.map(|i| (difference(i) - difference(i + apart)).abs());
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        self.sample.extend(changes.filter(|d| !d.is_nan()).map(|d| d * half));
         if self.sample.is_empty() {
             return SIGMA_PX[0];
         }
