@@ -33,15 +33,26 @@ pub(super) unsafe fn blocks(
                 // SAFETY: the caller's promise covers 3 samples on both sides.
                 unsafe {
                     let p = rows[f].as_ptr().add(x0 + at);
-                    let load = |o: isize| _mm256_loadu_si256(p.offset(o).cast());
-                    grey[f] = _mm256_mulhrs_epi16(load(0), quarter);
-                    let slope = |o: isize| _mm256_subs_epi16(load(o), load(-o));
+                    // Written out: closures over vectors are not always inlined.
+                    grey[f] = _mm256_mulhrs_epi16(_mm256_loadu_si256(p.offset(0).cast()), quarter);
+                    let near = _mm256_subs_epi16(
+                        _mm256_loadu_si256(p.offset(1).cast()),
+                        _mm256_loadu_si256(p.offset(-1).cast()),
+                    );
+                    let middle = _mm256_subs_epi16(
+                        _mm256_loadu_si256(p.offset(2).cast()),
+                        _mm256_loadu_si256(p.offset(-2).cast()),
+                    );
+                    let far = _mm256_subs_epi16(
+                        _mm256_loadu_si256(p.offset(3).cast()),
+                        _mm256_loadu_si256(p.offset(-3).cast()),
+                    );
                     gradient[f] = _mm256_add_epi16(
                         _mm256_add_epi16(
-                            _mm256_mulhrs_epi16(slope(1), c[0]),
-                            _mm256_mulhrs_epi16(slope(2), c[1]),
+                            _mm256_mulhrs_epi16(near, c[0]),
+                            _mm256_mulhrs_epi16(middle, c[1]),
                         ),
-                        _mm256_mulhrs_epi16(slope(3), c[2]),
+                        _mm256_mulhrs_epi16(far, c[2]),
                     );
                 }
             }
