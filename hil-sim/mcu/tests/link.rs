@@ -226,7 +226,7 @@ fn a_million_bytes_of_noise(variant: Variant) {
     while sent < BYTES {
         let mut chunk = Vec::new();
         while chunk.len() < 1_000 {
-            if noise.next() % 3 == 0 {
+            if noise.next().is_multiple_of(3) {
                 chunk.extend((0..1 + noise.next() % 100).map(|_| noise.next() as u8));
             } else {
                 // A valid frame with some of its bytes changed, cut or doubled.
