@@ -1,7 +1,7 @@
 //! The emulated chip behind the simulator's [`Controller`]: bytes over the UART (F330) or over a USB
 //! host that enumerates it first (F350), pins as edges.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use stspp_hil_sim::device::{Controller, Line, PinEdge};
 use stspp_protocol::usb;
@@ -18,6 +18,20 @@ use crate::usb::host::{BusState, Request, UrbId, UrbStatus};
 const BULK_IN_BYTES: usize = 64;
 /// How often the USB host side looks for finished requests.
 const HOST_LOOK_NS: u64 = 100_000;
+
+/// Where `cargo xtask firmware` puts a board's ELF: in the folder named by the environment variable
+/// `STSPP_FIRMWARE_DIR`, or in the workspace's `target/firmware`.
+#[must_use]
+pub fn firmware_elf(variant: Variant) -> PathBuf {
+    let name = match variant {
+        Variant::F330 => "f330.elf",
+        Variant::F350 => "f350.elf",
+    };
+    let workspace = concat!(env!("CARGO_MANIFEST_DIR"), "/../../target/firmware");
+    std::env::var_os("STSPP_FIRMWARE_DIR")
+        .map_or_else(|| PathBuf::from(workspace), PathBuf::from)
+        .join(name)
+}
 
 /// Why there is no emulated controller.
 #[derive(Debug, thiserror::Error)]

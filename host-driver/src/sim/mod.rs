@@ -15,6 +15,7 @@ pub mod rig;
 
 use std::sync::{Arc, Mutex};
 
+use stspp_hil_sim::device::Controller;
 use stspp_hil_sim::device::in_process::{InProcess, InProcessOptions};
 use stspp_hil_sim::world::{CameraModel, SensorModel, World};
 
@@ -23,7 +24,7 @@ use crate::{CameraIntrinsics, Error, StereoCalibration};
 
 pub use cameras::SimCameras;
 pub use link::SimLink;
-pub use options::{Pace, SimOptions};
+pub use options::{Pace, SimMcu, SimOptions};
 pub use rig::Rig;
 
 /// The parts of a simulated sensor.
@@ -48,8 +49,11 @@ impl SimSensor {
     /// # Errors
     /// [`Error::Simulation`] for a scene or model that cannot be.
     pub fn new(options: &SimOptions) -> Result<Self, Error> {
-        let controller = InProcess::new(InProcessOptions::seeded(options.seed));
-        Self::with_controller(options, Box::new(controller))
+        let controller: Box<dyn Controller> = match options.mcu {
+            SimMcu::InProcess => Box::new(InProcess::new(InProcessOptions::seeded(options.seed))),
+            emulated => emulated_chip(emulated)?,
+        };
+        Self::with_controller(options, controller)
     }
 
     /// A sensor with another controller, such as an emulated chip.
@@ -58,7 +62,7 @@ impl SimSensor {
     /// As [`SimSensor::new`].
     pub fn with_controller(
         options: &SimOptions,
-        controller: Box<dyn stspp_hil_sim::device::Controller>,
+        controller: Box<dyn Controller>,
     ) -> Result<Self, Error> {
         let model = options.model();
         let calibration = calibration_of(&model);
@@ -91,6 +95,25 @@ impl SimSensor {
             calibration: self.calibration,
         }
     }
+}
+
+/// The firmware's binary on an emulated chip.
+#[cfg(feature = "mcu")]
+fn emulated_chip(mcu: SimMcu) -> Result<Box<dyn Controller>, Error> {
+    use stspp_hil_mcu::controller::{McuController, firmware_elf};
+    use stspp_hil_mcu::soc::Variant;
+    let variant = if mcu == SimMcu::F330 { Variant::F330 } else { Variant::F350 };
+    match McuController::load(variant, &firmware_elf(variant)) {
+        Ok(controller) => Ok(Box::new(controller)),
+        Err(error) => Err(Error::Simulation(error.to_string())),
+    }
+}
+
+#[cfg(not(feature = "mcu"))]
+fn emulated_chip(_mcu: SimMcu) -> Result<Box<dyn Controller>, Error> {
+    Err(Error::Simulation(
+        "the option mcu needs the feature `mcu`: cargo run --features mcu".to_owned(),
+    ))
 }
 
 /// The calibration of a sensor model.

@@ -8,7 +8,7 @@ use crate::{Error, UriError};
 pub const DEFAULT_SCENE: &str = "sphere";
 
 /// Options of the sensor; a scene has its own besides.
-const KNOWN: &str = "seed, scale, bits, pace, rig, and the scene's own (stspp list --scenes)";
+const KNOWN: &str = "seed, scale, bits, pace, rig, mcu, and the scene's own (stspp list --scenes)";
 
 /// Options of the sensor: name, default, what it does.
 pub const SENSOR_OPTIONS: &[(&str, &str, &str)] = &[
@@ -17,6 +17,7 @@ pub const SENSOR_OPTIONS: &[(&str, &str, &str)] = &[
     ("bits", "8", "bits of a pixel; 8, 10 or 12"),
     ("pace", "fast", "fast: time passes as frames are consumed; real: as on the wall"),
     ("rig", "default", "default, or a whole number for a rig with other optics and poses"),
+    ("mcu", "none", "none: the firmware's logic in process; f330 or f350: its binary, emulated"),
 ];
 
 /// How fast simulated time passes.
@@ -27,6 +28,18 @@ pub enum Pace {
     Fast,
     /// As fast as wall time, so that a slow consumer loses frames as it would with hardware.
     Real,
+}
+
+/// What runs the sensor's controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum SimMcu {
+    /// The firmware's logic, in process.
+    #[default]
+    InProcess,
+    /// The firmware's binary on an emulated GD32F330, over its serial link.
+    F330,
+    /// The firmware's binary on an emulated GD32F350, over USB.
+    F350,
 }
 
 /// A simulated sensor.
@@ -46,6 +59,8 @@ pub struct SimOptions {
     pub pace: Pace,
     /// Another rig, with perturbed optics and poses, for each seed.
     pub rig_seed: Option<u64>,
+    /// What runs its controller.
+    pub mcu: SimMcu,
 }
 
 impl SimOptions {
@@ -61,6 +76,7 @@ impl SimOptions {
         let mut bits = 8;
         let mut pace = Pace::default();
         let mut rig_seed = None;
+        let mut mcu = SimMcu::default();
         let mut of_scene = Vec::new();
         for (name, value) in options {
             let wrong = |expected: &str| UriError::OptionValue {
@@ -95,6 +111,14 @@ impl SimOptions {
                         _ => return Err(wrong("fast or real").into()),
                     };
                 }
+                "mcu" => {
+                    mcu = match value.as_str() {
+                        "none" => SimMcu::InProcess,
+                        "f330" => SimMcu::F330,
+                        "f350" => SimMcu::F350,
+                        _ => return Err(wrong("none, f330 or f350").into()),
+                    };
+                }
                 _ => of_scene.push((name.as_str(), value.as_str())),
             }
         }
@@ -109,7 +133,7 @@ impl SimOptions {
         let scene = SceneSpec::parse(scene_name, &of_scene)
             .map_err(|error| Error::Simulation(error.to_string()))?;
         let scene_name = scene_name.to_owned();
-        Ok(Self { scene, scene_name, seed, scale, bits, pace, rig_seed })
+        Ok(Self { scene, scene_name, seed, scale, bits, pace, rig_seed, mcu })
     }
 
     /// The sensor's optics and electronics.
@@ -153,6 +177,7 @@ mod tests {
         assert!(parse("sim:plane?colour=red").unwrap_err().contains("colour"));
         assert!(parse("sim:plane?scale=3").unwrap_err().contains("1, 2, 4, 8 or 16"));
         assert!(parse("sim:plane?bits=9").unwrap_err().contains("8, 10 or 12"));
+        assert!(parse("sim:plane?mcu=avr").unwrap_err().contains("f330 or f350"));
         assert!(parse("sim:plane?pace=slow").unwrap_err().contains("fast or real"));
         assert!(parse("sim:plane?distance_m=far").unwrap_err().contains("distance_m"));
     }

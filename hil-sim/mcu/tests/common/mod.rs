@@ -2,30 +2,16 @@
 //! that it does nothing, and passes.
 #![allow(dead_code, reason = "each test binary uses its part")]
 
-use std::path::PathBuf;
-
-use stspp_hil_mcu::controller::McuController;
+use stspp_hil_mcu::controller::{McuController, firmware_elf};
 use stspp_hil_mcu::image::Image;
 use stspp_hil_mcu::session::Session;
 use stspp_hil_mcu::soc::Variant;
 
 pub const BOARDS: [Variant; 2] = [Variant::F330, Variant::F350];
 
-pub fn elf_path(variant: Variant) -> PathBuf {
-    let name = match variant {
-        Variant::F330 => "f330.elf",
-        Variant::F350 => "f350.elf",
-    };
-    let folder = std::env::var_os("STSPP_FIRMWARE_DIR").map_or_else(
-        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../target/firmware")),
-        PathBuf::from,
-    );
-    folder.join(name)
-}
-
 /// The image of a board, or a printed line that says that the test does nothing.
 pub fn image(variant: Variant) -> Option<Image> {
-    let path = elf_path(variant);
+    let path = firmware_elf(variant);
     if !path.exists() {
         println!(
             "SKIPPED for {variant:?}: {} is not there; build it with `cargo xtask firmware`",
