@@ -1,7 +1,7 @@
 //! The dense stage's two filters: an 8-tap interpolation kernel per 1/16 px and a 6-tap gradient.
 //!
 //! Both are least-squares designs: the weighted error of the frequency response is smallest, with
-//! the spectrum of a Gaussian dot of [`DESIGN_SIGMA_PX`] as the weight plus a small floor. The
+//! the spectrum of a Gaussian dot of `DESIGN_SIGMA_PX` as the weight plus a small floor. The
 //! interpolation position is rounded to 1/16 px; because the fit is linear about the *rounded*
 //! position and for the disparity itself, that rounding cancels to first order.
 

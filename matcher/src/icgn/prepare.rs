@@ -11,7 +11,7 @@ use crate::{
 /// Largest subset radius: a row of a subset fits in [`LANES`] columns.
 pub const SUBSET_RADIUS_LIMIT: usize = 7;
 
-/// Columns and rows of margin around [`Prepared::row_sums`] that a subset may reach into.
+/// Columns and rows of margin around `Prepared::row_sums` that a subset may reach into.
 pub const MARGIN: usize = 8;
 
 /// Coefficients stored beyond either end of a right row.
