@@ -2,6 +2,7 @@
 
 mod arrows;
 mod debian;
+mod e2e;
 mod firmware;
 mod licences;
 mod stage;
@@ -18,6 +19,7 @@ cargo xtask licences         check the licences of everything that ships against
 cargo xtask firmware [f330] [f350] [--install] [--test]
                              builds the firmware, prints flash and RAM, fails over budget;
                              --install gets the compiler's target, --test runs its host tests
+cargo xtask e2e              plugs simulated USB cameras into a Debian kernel in QEMU
 cargo xtask help             this text";
 
 fn main() -> ExitCode {
@@ -26,6 +28,7 @@ fn main() -> ExitCode {
     let outcome = match arguments.as_slice() {
         ["test"] => return test::run(test::Depth::Full),
         ["test", "--quick"] => return test::run(test::Depth::Quick),
+        ["e2e"] => e2e::run(),
         ["arrows"] => workspace::metadata().and_then(|m| arrows::check(&m)),
         ["licences"] => workspace::metadata().and_then(|m| licences::check(&m)),
         ["firmware", rest @ ..] => firmware::run(rest),
