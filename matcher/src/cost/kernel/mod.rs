@@ -30,16 +30,16 @@ impl CostKernel {
     pub fn new(level: Level) -> Self {
         match level.usable() {
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: `usable` returns only levels whose instructions this machine has.
             Level::Avx512 => Self {
+                // SAFETY: `usable` returns only levels whose instructions this machine has.
                 costs: |w, p, i, f, c| unsafe { avx512::costs(w, p, i, f, c) },
                 smallest: |c| unsafe { avx512::smallest(c) },
                 find: |c, v| unsafe { avx512::find(c, v) },
                 keep_best: |c, x, b, bx| unsafe { avx512::keep_best(c, x, b, bx) },
             },
             #[cfg(target_arch = "x86_64")]
-            // SAFETY: as above.
             Level::Avx2 => Self {
+                // SAFETY: as above.
                 costs: |w, p, i, f, c| unsafe { avx2::costs(w, p, i, f, c) },
                 smallest: |c| unsafe { avx2::smallest(c) },
                 find: |c, v| unsafe { avx2::find(c, v) },
