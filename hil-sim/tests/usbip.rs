@@ -1,7 +1,10 @@
 //! The USB/IP server with a camera behind it, spoken to over loopback as a kernel would.
 
-use std::io::{Read, Write};
-use std::net::{TcpListener, TcpStream};
+#[path = "common/usbip_host.rs"]
+mod usbip_host;
+
+use std::io::Write;
+use std::net::TcpListener;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -9,6 +12,7 @@ use stspp_hil_sim::front::usb::UsbFunction;
 use stspp_hil_sim::front::usbip::server::{Export, Server};
 use stspp_hil_sim::front::uvc::descriptors::{Description, PixelFormat};
 use stspp_hil_sim::front::uvc::{Frame, FrameSource, Settings, UvcCamera};
+use usbip_host::Host;
 
 const WIDTH: u16 = 100;
 const HEIGHT: u16 = 70;
@@ -29,71 +33,6 @@ impl FrameSource for Counting {
 
     fn clock(&self) -> (u32, u16) {
         (96_000, 7)
-    }
-}
-
-struct Host {
-    stream: TcpStream,
-    sequence: u32,
-}
-
-/// Status and data of a reply.
-type Reply = (i32, Vec<u8>);
-
-impl Host {
-    fn connect(port: u16) -> Self {
-        let stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
-        Self { stream, sequence: 0 }
-    }
-
-    fn bytes(&mut self, count: usize) -> Vec<u8> {
-        let mut bytes = vec![0; count];
-        self.stream.read_exact(&mut bytes).unwrap();
-        bytes
-    }
-
-    fn import(&mut self, bus_id: &str) -> Option<Vec<u8>> {
-        let mut request = vec![1, 0x11, 0x80, 0x03, 0, 0, 0, 0];
-        request.extend(bus_id.as_bytes());
-        request.resize(8 + 32, 0);
-        self.stream.write_all(&request).unwrap();
-        let head = self.bytes(8);
-        (head[7] == 0).then(|| self.bytes(312))
-    }
-
-    fn send(
-        &mut self,
-        is_in: bool,
-        endpoint: u32,
-        length: usize,
-        setup: [u8; 8],
-        data: &[u8],
-    ) -> u32 {
-        self.sequence += 1;
-        let fields =
-            [1, self.sequence, 0x10001, u32::from(is_in), endpoint, 0, length as u32, 0, 0, 0];
-        let mut command: Vec<u8> = fields.iter().flat_map(|f: &u32| f.to_be_bytes()).collect();
-        command.extend(setup);
-        command.extend(data);
-        self.stream.write_all(&command).unwrap();
-        self.sequence
-    }
-
-    fn reply(&mut self, is_in: bool) -> (u32, u32, Reply) {
-        let head = self.bytes(48);
-        let word = |at: usize| u32::from_be_bytes(head[at..at + 4].try_into().unwrap());
-        let data = if word(0) == 3 && is_in { self.bytes(word(24) as usize) } else { vec![] };
-        (word(0), word(4), (word(20) as i32, data))
-    }
-
-    fn control(&mut self, setup: [u8; 8], data: &[u8]) -> Reply {
-        let is_in = setup[0] & 0x80 != 0;
-        let length = usize::from(u16::from_le_bytes([setup[6], setup[7]]));
-        let sequence = self.send(is_in, 0, length, setup, data);
-        let (kind, answered, reply) = self.reply(is_in);
-        assert_eq!((kind, answered), (3, sequence));
-        reply
     }
 }
 
@@ -214,13 +153,8 @@ fn a_waiting_transfer_can_be_given_up_and_blocks_nothing() {
     let waiting = host.send(true, 1, 512, [0; 8], &[]);
     // Nothing to send yet, but control transfers go on.
     assert_eq!(host.control([0x80, 8, 0, 0, 0, 0, 1, 0], &[]), (0, vec![1]));
-    host.sequence += 1;
-    let mut unlink: Vec<u8> =
-        [2, host.sequence, 0, 0, 0, waiting].iter().flat_map(|f: &u32| f.to_be_bytes()).collect();
-    unlink.resize(48, 0);
-    host.stream.write_all(&unlink).unwrap();
-    let (kind, sequence, (status, _)) = host.reply(false);
-    assert_eq!((kind, sequence, status), (4, host.sequence, -104));
+    let unlink = host.unlink(waiting);
+    assert_eq!(host.reply(false), (4, unlink, (-104, vec![])));
     // An endpoint that is not there stalls.
     let stalled = host.send(true, 3, 64, [0; 8], &[]);
     assert_eq!(host.reply(true), (3, stalled, (-32, vec![])));

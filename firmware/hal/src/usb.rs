@@ -9,7 +9,8 @@ use crate::interrupt::{Interrupt, InterruptExt};
 use crate::peripherals::{PA11, PA12, USBFS};
 use crate::regs;
 use embassy_usb_driver::{
-    Bus as BusTrait, EndpointAddress, EndpointAllocError, EndpointType, Event, Unsupported,
+    Bus as BusTrait, Direction, EndpointAddress, EndpointAllocError, EndpointType, Event,
+    Unsupported,
 };
 use embassy_usb_synopsys_otg::otg_v1::Otg;
 use embassy_usb_synopsys_otg::{
@@ -117,6 +118,16 @@ impl Bus<'_> {
         unsafe { Interrupt::USBFS.enable() };
         self.started = true;
     }
+
+    /// Takes back what waited for the host's token when the bus was reset. The core keeps EPENA over
+    /// a bus reset, and a writer waits until it is clear: without this, an endpoint whose last
+    /// packet was never fetched would stay silent after the next configuration.
+    fn abandon_in_transfers(&mut self) {
+        for index in 1..USB_ENDPOINTS {
+            let address = EndpointAddress::from_parts(index, Direction::In);
+            self.inner.endpoint_set_enabled(address, false);
+        }
+    }
 }
 
 impl BusTrait for Bus<'_> {
@@ -132,7 +143,11 @@ impl BusTrait for Bus<'_> {
         if !self.started {
             self.start();
         }
-        self.inner.poll().await
+        let event = self.inner.poll().await;
+        if matches!(event, Event::Reset) {
+            self.abandon_in_transfers();
+        }
+        event
     }
 
     fn endpoint_set_enabled(&mut self, address: EndpointAddress, enabled: bool) {

@@ -83,6 +83,8 @@ pub struct McuController {
     /// Lines that are high.
     high: Vec<Line>,
     link_connected: bool,
+    /// Another host has the USB port; see [`McuController::lend_usb`].
+    usb_lent: bool,
 }
 
 impl McuController {
@@ -110,6 +112,7 @@ impl McuController {
             changes: Vec::new(),
             high: Vec::new(),
             link_connected: true,
+            usb_lent: false,
         };
         controller.set_interlock_closed(true);
         controller.set_temperature_c(25.0);
@@ -186,6 +189,23 @@ impl McuController {
         Ok(())
     }
 
+    /// Lets go of the USB port, so that another host can use it (see [`crate::front`]): from now on
+    /// nothing is read, written or enumerated here. What enumeration had found; `None` without USB.
+    pub fn lend_usb(&mut self) -> Option<Enumerated> {
+        let link = self.usb.as_mut()?;
+        self.usb_lent = true;
+        let reads = [link.replies.take(), link.events.take()];
+        let enumerated = link.enumerated.clone();
+        let now_ns = self.chip.now_ns();
+        let mut soc = self.chip.soc();
+        let host = soc.usbfs.host();
+        for id in reads.into_iter().flatten() {
+            host.unlink(id, now_ns);
+        }
+        while host.take_completion().is_some() {}
+        enumerated
+    }
+
     /// Suspends the bus (the host goes to sleep), or resumes it.
     pub fn set_bus_suspended(&mut self, suspended: bool) {
         let now_ns = self.chip.now_ns();
@@ -213,7 +233,7 @@ impl McuController {
     fn keep_reading(&mut self) {
         let Some(link) = &self.usb else { return };
         let active = self.chip.soc().usbfs.host().state() == BusState::Active;
-        if !link.configured || !active {
+        if !link.configured || !active || self.usb_lent {
             return;
         }
         let (replies, events) = (link.replies.is_none(), link.events.is_none());
@@ -237,6 +257,9 @@ impl McuController {
 
     /// Takes finished USB requests, and enumerates again when the device came back.
     fn serve_usb(&mut self) {
+        if self.usb_lent {
+            return;
+        }
         let Some(link) = &mut self.usb else { return };
         let mut soc = self.chip.soc();
         let host = soc.usbfs.host();
@@ -284,7 +307,7 @@ impl Controller for McuController {
 
     fn host_write(&mut self, bytes: &[u8]) {
         if self.usb.is_some() {
-            if self.link_connected && !bytes.is_empty() {
+            if self.link_connected && !self.usb_lent && !bytes.is_empty() {
                 self.submit(Request::Out {
                     endpoint: usb::ENDPOINT_REQUESTS & 0xf,
                     data: bytes.to_vec(),

@@ -16,6 +16,7 @@ pub mod controller;
 pub mod cpu;
 #[cfg(feature = "defmt-log")]
 pub mod defmt_log;
+pub mod front;
 pub mod image;
 pub mod measure;
 pub mod rtt;

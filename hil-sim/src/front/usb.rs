@@ -29,6 +29,12 @@ impl Setup {
         }
     }
 
+    /// The packet as it is on the wire.
+    pub fn to_bytes(self) -> [u8; 8] {
+        let [v, i, l] = [self.value, self.index, self.length].map(u16::to_le_bytes);
+        [self.request_type, self.request, v[0], v[1], i[0], i[1], l[0], l[1]]
+    }
+
     /// Whether the data stage goes to the host.
     pub fn is_in(&self) -> bool {
         self.request_type & 0x80 != 0
@@ -72,6 +78,19 @@ pub enum Answer<T> {
     Nak,
     /// Refused; a halted endpoint stays so until the host clears it.
     Stall,
+    /// The transfer went wrong on the bus.
+    Broken(BusError),
+}
+
+/// What goes wrong on a bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BusError {
+    /// No handshake came in three attempts.
+    NoAnswer,
+    /// The device sent more than the host had asked for.
+    Babble,
+    /// The device is unplugged, or has let go of the bus.
+    Gone,
 }
 
 /// Bus speed.
@@ -138,4 +157,13 @@ pub trait UsbFunction: Send {
 
     /// Lets the device do what is due. Called at least every millisecond or so of the server's time.
     fn poll(&mut self);
+
+    /// The host gives up the transfer that was offered last on this pipe and not answered.
+    fn unlinked(&mut self, _endpoint: u8, _is_in: bool) {}
+
+    /// Whether the device is still the one that was [`reset`](UsbFunction::reset) last: false once it
+    /// was unplugged or has left the bus on its own, until the next reset.
+    fn is_attached(&self) -> bool {
+        true
+    }
 }

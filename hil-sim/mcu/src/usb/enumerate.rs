@@ -13,7 +13,8 @@ pub const TIMEOUT_NS: u64 = 5_000_000_000;
 const ATTACH_NS: u64 = 2_000_000_000;
 /// How often the host looks while it waits.
 const LOOK_NS: u64 = 20_000;
-const ADDRESS: u8 = 5;
+/// Address that the device gets.
+pub(crate) const ADDRESS: u8 = 5;
 
 /// What went wrong on the bus.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

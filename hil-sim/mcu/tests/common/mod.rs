@@ -2,6 +2,7 @@
 //! that it does nothing, and passes.
 #![allow(dead_code, reason = "each test binary uses its part")]
 
+use stspp_hil_mcu::chip::Chip;
 use stspp_hil_mcu::controller::{McuController, firmware_elf};
 use stspp_hil_mcu::image::Image;
 use stspp_hil_mcu::session::Session;
@@ -42,6 +43,11 @@ pub fn log(session: &mut Session<McuController>) -> Vec<String> {
 
 /// Fails where the firmware touched a register or bit that has no model.
 pub fn assert_all_modelled(session: &mut Session<McuController>) {
-    let touched = session.controller.chip().unmodelled();
+    assert_chip_modelled(session.controller.chip());
+}
+
+/// The same for a chip.
+pub fn assert_chip_modelled(chip: &Chip) {
+    let touched = chip.unmodelled();
     assert!(touched.is_empty(), "not modelled: {touched:#?}");
 }

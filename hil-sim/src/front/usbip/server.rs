@@ -3,7 +3,7 @@
 use super::{session, wire};
 use crate::front::usb::UsbFunction;
 use std::io::{self, Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -75,8 +75,10 @@ impl Server {
     /// One connection: a listing, or an import and all that follows.
     fn converse(&self, stream: &TcpStream) -> io::Result<String> {
         let reader = stream.try_clone()?;
-        let said = self.serve(reader, stream)?;
-        Ok(said)
+        let said = self.serve(reader, stream);
+        // The thread that reads holds the socket too: only this closes it.
+        let _ = stream.shutdown(Shutdown::Both);
+        said
     }
 
     /// Serves one byte stream in both directions: an operation, then, if it was an import, the
@@ -130,11 +132,15 @@ impl Server {
         reader: impl Read + Send + 'static,
         mut writer: impl Write,
     ) -> io::Result<()> {
-        let identity = {
+        let (attached, identity) = {
             let mut function = lock(export)?;
             function.reset();
-            function.identity()
+            (function.is_attached(), function.identity())
         };
+        if !attached {
+            writer.write_all(&wire::operation_header(wire::OP_REP_IMPORT, false))?;
+            return Err(io::Error::other(format!("{} is unplugged", wire::bus_id(number))));
+        }
         let mut reply = wire::operation_header(wire::OP_REP_IMPORT, true);
         reply.extend(wire::device_record(number, &identity));
         writer.write_all(&reply)?;

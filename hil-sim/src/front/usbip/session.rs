@@ -2,7 +2,7 @@
 //! answers, are given up when the host says so, and never block each other.
 
 use super::wire::{self, Command, Submit};
-use crate::front::usb::{Answer, Setup, UsbFunction};
+use crate::front::usb::{Answer, BusError, Setup, UsbFunction};
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,16 +13,24 @@ use std::time::Duration;
 const EPIPE: i32 = -32;
 const ECONNRESET: i32 = -104;
 const EINVAL: i32 = -22;
+const EPROTO: i32 = -71;
+const EOVERFLOW: i32 = -75;
+const ESHUTDOWN: i32 = -108;
 
 /// How long the worker waits for a command before it lets the device run: a USB frame.
 const TICK: Duration = Duration::from_millis(1);
+
+/// Endpoint number, and whether data goes to the host (false for endpoint 0).
+type Pipe = (u8, bool);
 
 /// Transfers that the host has asked for and the device has not answered, and the bytes to send back.
 #[derive(Default)]
 pub struct Transfers {
     /// By endpoint number; control, OUT and IN of one number wait apart.
-    waiting: Vec<((u8, bool), VecDeque<Submit>)>,
+    waiting: Vec<(Pipe, VecDeque<Submit>)>,
     replies: Vec<u8>,
+    /// Pipes whose foremost transfer was given up; the device has not been told.
+    unlinked: Vec<Pipe>,
 }
 
 impl Transfers {
@@ -42,11 +50,14 @@ impl Transfers {
             }
             Command::Unlink { sequence, victim } => {
                 let mut status = 0;
-                for (_, queue) in &mut self.waiting {
-                    let before = queue.len();
-                    queue.retain(|s| s.sequence != victim);
-                    if queue.len() < before {
-                        status = ECONNRESET;
+                for (pipe, queue) in &mut self.waiting {
+                    let Some(at) = queue.iter().position(|s| s.sequence == victim) else {
+                        continue;
+                    };
+                    queue.remove(at);
+                    status = ECONNRESET;
+                    if at == 0 {
+                        self.unlinked.push(*pipe);
                     }
                 }
                 self.replies.extend(wire::unlink_reply(sequence, status));
@@ -56,6 +67,9 @@ impl Transfers {
 
     /// Offers every waiting transfer to the device, as far as each endpoint goes.
     pub fn serve(&mut self, function: &mut dyn UsbFunction) {
+        for (endpoint, is_in) in self.unlinked.drain(..) {
+            function.unlinked(endpoint, is_in);
+        }
         for (_, queue) in &mut self.waiting {
             while let Some(submit) = queue.front() {
                 let Some(reply) = offer(function, submit) else { break };
@@ -93,6 +107,7 @@ fn offer(function: &mut dyn UsbFunction, submit: &Submit) -> Option<Vec<u8>> {
             }
             Answer::Nak => None,
             Answer::Stall => refused(EPIPE),
+            Answer::Broken(error) => refused(errno(error)),
         };
     }
     if submit.is_in {
@@ -103,17 +118,28 @@ fn offer(function: &mut dyn UsbFunction, submit: &Submit) -> Option<Vec<u8>> {
             }
             Answer::Nak => None,
             Answer::Stall => refused(EPIPE),
+            Answer::Broken(error) => refused(errno(error)),
         }
     } else {
         match function.transfer_out(submit.endpoint, &submit.data) {
             Answer::Done(length) => Some(wire::submit_reply(sequence, 0, length, &[])),
             Answer::Nak => None,
             Answer::Stall => refused(EPIPE),
+            Answer::Broken(error) => refused(errno(error)),
         }
     }
 }
 
-/// Serves an imported device until the stream ends or `stop` is set. Reading has a thread of its own,
+/// What a Linux host controller says of an error on the bus.
+fn errno(error: BusError) -> i32 {
+    match error {
+        BusError::NoAnswer => EPROTO,
+        BusError::Babble => EOVERFLOW,
+        BusError::Gone => ESHUTDOWN,
+    }
+}
+
+/// Serves an imported device until the stream ends, the device is gone or `stop` is set. Reading has a thread of its own,
 /// which ends with the stream.
 ///
 /// # Errors
@@ -153,16 +179,21 @@ pub fn run(
         if stop.load(Ordering::Relaxed) {
             return Ok(());
         }
-        {
+        let attached = {
             let mut function =
                 function.lock().map_err(|_| io::Error::other("the simulated device has died"))?;
             function.poll();
             transfers.serve(&mut *function);
-        }
+            function.is_attached()
+        };
         let replies = transfers.take_replies();
         if !replies.is_empty() {
             writer.write_all(&replies)?;
             writer.flush()?;
+        }
+        if !attached {
+            // The end of the connection is how a host learns that the device was unplugged.
+            return Ok(());
         }
     }
 }
