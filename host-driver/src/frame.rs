@@ -50,7 +50,8 @@ pub struct DepthFrame {
     pub zncc: Image<f32>,
     /// Brightness of the left camera: mean of the window's frames, 255 is the camera's full scale.
     pub intensity: Image<u8>,
-    /// Speed along depth in metres per second where motion is estimated, NaN where the depth is.
+    /// Speed along depth in metres per second, positive away from the sensor: zero where nothing moves
+    /// significantly, NaN where the depth is. `None` where motion is not estimated, or without times.
     pub depth_rate_m_per_s: Option<Image<f32>>,
     /// What lit the frames of the window, oldest first; empty when the source knows none.
     pub labels: Vec<SlotLabel>,

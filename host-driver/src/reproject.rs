@@ -140,7 +140,7 @@ pub fn depth_frame(
     });
     let time_device_s = match labels.last() {
         None => None,
-        Some(newest) if matched.rate_px_per_s.is_some() => Some(newest.exposure_centre_s()),
+        Some(newest) if matched.at_newest => Some(newest.exposure_centre_s()),
         Some(_) => {
             let sum: f64 = labels.iter().map(SlotLabel::exposure_centre_s).sum();
             Some(sum / labels.len() as f64)

@@ -129,6 +129,7 @@ fn a_frames_depth_and_cloud_agree_with_its_geometry() {
     let mut matched = stspp_matcher::Matched {
         disparity_px: Image::new(w, h, f32::NAN),
         zncc: Image::new(w, h, f32::NAN),
+        at_newest: true,
         rate_px_per_s: Some(Image::new(w, h, f32::NAN)),
         stages: Vec::new(),
     };

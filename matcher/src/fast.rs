@@ -7,6 +7,7 @@ use crate::{
     coarse::{Coarse, CoarseMap, INVALID},
     dense::{
         DenseFit, DenseMaps, mark_steps,
+        motion::MotionFit,
         order::{OrderChoice, accept},
     },
     regions::Regions,
@@ -22,9 +23,18 @@ pub(crate) struct Fast {
     start: Image<f32>,
     step: Image<u8>,
     fit: DenseFit,
+    motion: MotionFit,
     maps: DenseMaps,
     order: OrderChoice,
     regions: Regions,
+}
+
+/// Maps of a frame on the left canvas, NaN together.
+pub(crate) struct Found {
+    pub disparity: Image<f32>,
+    pub zncc: Image<f32>,
+    /// Rate of the disparity in px per second, or per frame where the stack has no times.
+    pub rate: Option<Image<f32>>,
 }
 
 impl Fast {
@@ -38,18 +48,19 @@ impl Fast {
             start: Image::new(0, 0, f32::NAN),
             step: Image::new(0, 0, 0),
             fit: DenseFit::new(level, a.subset_radius, params.shape, a.surface_px),
+            motion: MotionFit::new(level),
             maps: DenseMaps::new(0, 0),
             order: OrderChoice::default(),
             regions: Regions::default(),
         }
     }
 
-    /// Disparity and ZNCC of a checked stack; `done` is told the name of each stage at its end.
+    /// Disparity, ZNCC and rate of a checked stack; `done` is told the name of each stage at its end.
     pub(crate) fn run(
         &mut self,
         stack: &StereoStack<'_>,
         mut done: impl FnMut(&'static str),
-    ) -> (Image<f32>, Image<f32>) {
+    ) -> Found {
         let (width, height) = (stack.width(), stack.height());
         if (self.start.width(), self.start.height()) != (width, height) {
             self.start = Image::new(width, height, f32::NAN);
@@ -70,6 +81,14 @@ impl Fast {
         done("steps");
         self.fit.fit(stack, &self.start, &self.step, &mut self.maps);
         done("dense");
+        let rate = if self.params.motion {
+            let rate =
+                self.motion.run(stack, &mut self.fit, &self.start, &self.step, &mut self.maps);
+            done("motion");
+            Some(rate.unwrap_or_else(|| Image::new(width, height, 0.0)))
+        } else {
+            None
+        };
         let mut disparity = Image::new(width, height, f32::NAN);
         let zncc_min = self.params.zncc_min;
         let DenseMaps { first_px, second_px, zncc } = &mut self.maps;
@@ -86,8 +105,14 @@ impl Fast {
         for (z, d) in zncc.as_mut_slice().iter_mut().zip(disparity.as_slice()) {
             *z = if d.is_nan() { f32::NAN } else { *z };
         }
+        let rate = rate.map(|mut rate| {
+            for (v, d) in rate.as_mut_slice().iter_mut().zip(disparity.as_slice()) {
+                *v = if d.is_nan() { f32::NAN } else { *v };
+            }
+            rate
+        });
         done("regions");
-        (disparity, zncc)
+        Found { disparity, zncc, rate }
     }
 }
 

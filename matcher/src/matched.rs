@@ -14,12 +14,15 @@ pub struct StageTime {
 /// Disparity and similarity of one stereo stack, on the left rectified canvas.
 #[derive(Debug, Clone)]
 pub struct Matched {
-    /// Disparity x_left - x_right in pixels; NaN is invalid. Refers to the newest frame's time where
-    /// motion is estimated.
+    /// Disparity x_left - x_right in pixels; NaN is invalid.
     pub disparity_px: Image<f32>,
     /// ZNCC = 1 - ZNSSD / 2 of the refined subset, -1..=1; NaN where the disparity is.
     pub zncc: Image<f32>,
-    /// Disparity's rate in px per second where motion is estimated, NaN where invalid.
+    /// Whether the disparity is the newest frame's, as it is where motion is estimated; otherwise a
+    /// moving surface's is a mean over the frames.
+    pub at_newest: bool,
+    /// Disparity's rate in px per second, zero where nothing moves significantly and NaN where the
+    /// disparity is; `None` where motion is not estimated or the stack has no times.
     pub rate_px_per_s: Option<Image<f32>>,
     /// Time of each stage, in order.
     pub stages: Vec<StageTime>,

@@ -65,6 +65,10 @@ pub struct Params {
     pub shape: ShapeFunction,
     /// Points with a lower ZNCC are invalid.
     pub zncc_min: f32,
+    /// Whether the disparity's rate is estimated, so that a moving surface measures as well as one at
+    /// rest and its depth is the newest frame's. By [`Method::Dense`] from three frames on; the other
+    /// methods give a mean over the frames.
+    pub motion: bool,
     /// The rest.
     pub advanced: Advanced,
 }
@@ -131,6 +135,7 @@ impl Params {
             method: Method::default(),
             shape: ShapeFunction::default(),
             zncc_min: 0.8,
+            motion: true,
             advanced: Advanced::default(),
         }
     }

@@ -112,8 +112,14 @@ impl Matcher {
         let mut clock = Clock::start();
         let Self { fast, level, params, .. } = self;
         let fast = fast.get_or_insert_with(|| Fast::new(*level, params));
-        let (disparity_px, zncc) = fast.run(stack, |stage| clock.stage(stage));
-        Matched { disparity_px, zncc, rate_px_per_s: None, stages: clock.stages }
+        let found = fast.run(stack, |stage| clock.stage(stage));
+        Matched {
+            disparity_px: found.disparity,
+            zncc: found.zncc,
+            at_newest: found.rate.is_some(),
+            rate_px_per_s: found.rate.filter(|_| stack.times_s.is_some()),
+            stages: clock.stages,
+        }
     }
 
     fn parabola(&mut self, stack: &StereoStack<'_>) -> Matched {
@@ -123,6 +129,7 @@ impl Matcher {
         Matched {
             disparity_px: coarse.disparity_px,
             zncc,
+            at_newest: false,
             rate_px_per_s: None,
             stages: clock.stages,
         }
@@ -151,7 +158,7 @@ impl Matcher {
             *z = if d.is_nan() { f32::NAN } else { *z };
         }
         clock.stage("outlier");
-        Matched { disparity_px, zncc, rate_px_per_s: None, stages: clock.stages }
+        Matched { disparity_px, zncc, at_newest: false, rate_px_per_s: None, stages: clock.stages }
     }
 }
 

@@ -98,6 +98,13 @@ impl Capture {
         full as f64 / count.max(1) as f64
     }
 
+    /// Centre of the newest of the recording's first `frames` exposures, in nanoseconds of the scene's
+    /// time.
+    pub fn newest_ns(&self, frames: usize) -> u64 {
+        let label = self.labels.get(frames.saturating_sub(1));
+        label.map_or(0, |label| (label.exposure_centre_s() * 1e9) as u64)
+    }
+
     /// Centre of the recording's exposures `first..first + frames` in nanoseconds of the scene's time.
     pub fn centre_ns(&self, frames: std::ops::Range<usize>) -> u64 {
         let times = self.labels[frames].iter().map(SlotLabel::exposure_centre_s);

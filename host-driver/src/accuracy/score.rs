@@ -137,11 +137,12 @@ fn eroded(image: &Image<bool>, margin: usize) -> Image<bool> {
     out
 }
 
-/// RMS of a plane fit over the central half (by area) of the valid canvas, in millimetres.
+/// RMS of a plane fit over the central half (by area) of the valid canvas, and the mean error along
+/// the ray there, in millimetres.
 ///
 /// # Errors
 /// When too few points are valid.
-pub fn central_plane_rms_mm(frame: &DepthFrame, truth: &CanvasTruth) -> Result<f64, FitError> {
+pub fn central_plane_mm(frame: &DepthFrame, truth: &CanvasTruth) -> Result<(f64, f64), FitError> {
     // The box of what both cameras see; its middle, with the area halved.
     let (mut x0, mut x1, mut y0, mut y1) = (usize::MAX, 0, usize::MAX, 0);
     for y in 0..truth.visible_to_both.height() {
@@ -157,13 +158,20 @@ pub fn central_plane_rms_mm(frame: &DepthFrame, truth: &CanvasTruth) -> Result<f
     };
     let ((x0, x1), (y0, y1)) = (half(x0, x1), half(y0, y1));
     let mut points = Vec::new();
+    let (mut sum_m, mut count) = (0.0, 0_u32);
     for y in y0..=y1.min(frame.depth_m.height().saturating_sub(1)) {
         for x in x0..=x1 {
+            let (z, true_z) = (frame.depth_m.row(y)[x], truth.depth_m.row(y)[x]);
+            let error = f64::from(z - true_z) * f64::from(truth.distance_m.row(y)[x] / true_z);
+            if error.abs() <= f64::from(OUTLIER_M) {
+                (sum_m, count) = (sum_m + error, count + 1);
+            }
             let d = frame.disparity_px.row(y)[x];
             points.extend(frame.geometry.point_left_m(x as f64, y as f64, f64::from(d)));
         }
     }
-    plane::fit(&points).map(|fit| fit.rms_m * 1e3)
+    let bias_mm = sum_m / f64::from(count.max(1)) * 1e3;
+    plane::fit(&points).map(|fit| (fit.rms_m * 1e3, bias_mm))
 }
 
 /// Sphere fit over the points of the object "sphere": RMS and radius error in millimetres.

@@ -4,7 +4,7 @@ use serde::Serialize;
 use stspp_hil_sim::world::{SceneSpec, SensorModel, WorldError};
 use stspp_matcher::{Error as MatchError, Matcher, Method, Params, ShapeFunction};
 
-use super::score::{central_plane_rms_mm, score, sphere_rms_mm};
+use super::score::{central_plane_mm, score, sphere_rms_mm};
 use super::{CanvasTruth, Capture, Score};
 use crate::DepthFrame;
 use crate::reconstruct::RectifiedStack;
@@ -51,6 +51,8 @@ pub struct Case {
     saturated: f64,
     stack: RectifiedStack,
     truth: CanvasTruth,
+    /// Of a moving scene: the truth at the newest frame's time.
+    newest: Option<CanvasTruth>,
 }
 
 /// One line of a table.
@@ -66,6 +68,8 @@ pub struct Line {
     pub shape_function: String,
     /// RMS of the plane fit over the central half, or of the sphere fit, in millimetres.
     pub fit_rms_mm: Option<f64>,
+    /// Mean error along the ray of a plane's central half, in millimetres.
+    pub bias_mm: Option<f64>,
     /// Error of the fitted sphere's radius in millimetres.
     pub radius_error_mm: Option<f64>,
     /// The sphere's fit RMS over points that neither camera sees at more than 60 degrees.
@@ -105,13 +109,13 @@ impl Case {
         let saturated = capture.saturated();
         // The raw images are not needed again, and there may be several cases.
         capture.pairs = Vec::new();
-        let truth = CanvasTruth::trace(
-            &capture.world,
-            stack.rectifier.geometry(),
-            stack.rectifier.left_mask(),
-            capture.centre_ns(0..stack.len()),
-        );
-        Ok(Self { capture, saturated, stack, truth })
+        let at = |time_ns| {
+            let (geometry, mask) = (stack.rectifier.geometry(), stack.rectifier.left_mask());
+            CanvasTruth::trace(&capture.world, geometry, mask, time_ns)
+        };
+        let truth = at(capture.centre_ns(0..stack.len()));
+        let newest = (!capture.world.is_still()).then(|| at(capture.newest_ns(stack.len())));
+        Ok(Self { capture, saturated, stack, truth, newest })
     }
 
     /// Rectified images of the case.
@@ -142,17 +146,22 @@ impl Case {
         let start = std::time::Instant::now();
         let frame = self.stack.depth_frame(&mut matcher, 0..frames)?;
         let match_wall_ms = start.elapsed().as_secs_f64() * 1e3;
-        let (world, truth) = (&self.capture.world, &self.truth);
+        let world = &self.capture.world;
+        // A matcher that estimates motion gives the newest frame's depth.
+        let with_motion = setting.method == Method::Dense && frames == self.stack.len();
+        let truth = self.newest.as_ref().filter(|_| with_motion).unwrap_or(&self.truth);
         let sphere = |incidence_max_deg| {
             let fit =
                 sphere_rms_mm(&frame, truth, world, SPHERE_RADIUS_M, MARGIN_PX, incidence_max_deg);
             fit.map_or((None, None), |(rms, radius)| (Some(rms), Some(radius)))
         };
-        let (mut fit, mut core) = ((None, None), (None, None));
+        let (mut fit, mut core, mut bias_mm) = ((None, None), (None, None), None);
         if scene.starts_with("sphere") {
             (fit, core) = (sphere(90.0), sphere(CORE_DEG));
         } else if scene.contains("plane") {
-            fit.0 = central_plane_rms_mm(&frame, truth).ok();
+            if let Ok((rms, bias)) = central_plane_mm(&frame, truth) {
+                (fit.0, bias_mm) = (Some(rms), Some(bias));
+            }
         }
         let line = Line {
             scene: scene.to_owned(),
@@ -160,6 +169,7 @@ impl Case {
             method: format!("{:?}", setting.method),
             shape_function: format!("{:?}", setting.shape),
             fit_rms_mm: fit.0,
+            bias_mm,
             radius_error_mm: fit.1,
             core_rms_mm: core.0,
             core_radius_error_mm: core.1,
@@ -173,46 +183,57 @@ impl Case {
 
 /// Lines as text columns.
 pub fn to_text(lines: &[Line]) -> String {
-    let mut text = format!(
-        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>8}\n",
-        "scene",
-        "N",
-        "method",
-        "order",
-        "fit RMS",
-        "radius",
-        "points",
-        "complete",
-        "outliers",
-        "surf RMS",
-        "median",
-        "match"
-    );
-    text += &format!(
-        "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>9} {:>9} {:>8} {:>9} {:>9} {:>9} {:>9} {:>7} {:>8}\n",
-        "", "", "", "", "mm", "mm", "mm", "mm", "", "%", "%", "mm", "mm", "%", "ms"
-    );
+    const HEADS: [(&str, &str, usize); 16] = [
+        ("scene", "", 16),
+        ("N", "", 2),
+        ("method", "", 9),
+        ("order", "", 7),
+        ("fit RMS", "mm", 9),
+        ("bias", "mm", 9),
+        ("radius", "mm", 9),
+        ("core RMS", "mm", 9),
+        ("radius", "mm", 9),
+        ("points", "", 8),
+        ("complete", "%", 9),
+        ("outliers", "%", 9),
+        ("surf RMS", "mm", 9),
+        ("median", "mm", 9),
+        ("full", "%", 7),
+        ("match", "ms", 8),
+    ];
+    let row = |cells: [String; 16]| {
+        let cells = cells.iter().zip(HEADS).enumerate().map(|(k, (cell, (_, _, width)))| {
+            if k == 0 || k == 2 || k == 3 {
+                format!("{cell:<width$}")
+            } else {
+                format!("{cell:>width$}")
+            }
+        });
+        cells.collect::<Vec<_>>().join(" ") + "\n"
+    };
+    let mut text = row(HEADS.map(|head| head.0.to_owned()));
+    text += &row(HEADS.map(|head| head.1.to_owned()));
     let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.4}"));
     for line in lines {
         let score = &line.score;
-        text += &format!(
-            "{:<16} {:>2} {:<9} {:<7} {:>9} {:>9} {:>9} {:>9} {:>8} {:>9.3} {:>9.4} {:>9.4} {:>9.4} {:>7.3} {:>8.0}\n",
-            line.scene,
-            line.frames,
-            line.method,
-            line.shape_function,
+        text += &row([
+            line.scene.clone(),
+            line.frames.to_string(),
+            line.method.clone(),
+            line.shape_function.clone(),
             number(line.fit_rms_mm),
+            number(line.bias_mm),
             number(line.radius_error_mm),
             number(line.core_rms_mm),
             number(line.core_radius_error_mm),
-            score.points,
-            100.0 * score.completeness,
-            100.0 * score.outliers,
-            score.surface_rms_mm,
-            score.surface_median_mm,
-            100.0 * line.saturated,
-            line.match_wall_ms,
-        );
+            score.points.to_string(),
+            format!("{:.3}", 100.0 * score.completeness),
+            format!("{:.4}", 100.0 * score.outliers),
+            format!("{:.4}", score.surface_rms_mm),
+            format!("{:.4}", score.surface_median_mm),
+            format!("{:.3}", 100.0 * line.saturated),
+            format!("{:.0}", line.match_wall_ms),
+        ]);
     }
     text
 }

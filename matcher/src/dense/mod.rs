@@ -15,6 +15,7 @@
 pub(crate) mod gradient;
 pub mod kernels;
 pub(crate) mod moments;
+pub mod motion;
 pub(crate) mod normalise;
 pub mod order;
 pub(crate) mod refit;
@@ -29,6 +30,7 @@ use rayon::prelude::*;
 use crate::{
     Image, Level, Sample, ShapeFunction, StereoStack, lanes::vectorised, params::RADIUS_LIMIT,
 };
+use motion::{BLOCK, Motion};
 use solve::Fits;
 use tile::{Job, Output, Tile};
 
@@ -93,6 +95,31 @@ impl DenseFit {
         if (out.first_px.width(), out.first_px.height()) != (width, height) {
             *out = DenseMaps::new(width, height);
         }
+        self.run(stack, start, step, None, out);
+    }
+
+    /// Fits anew the blocks that are set in `moving`, with `motion`, and leaves the others as they are.
+    pub(crate) fn refit(
+        &mut self,
+        stack: &StereoStack<'_>,
+        start: &Image<f32>,
+        step: &Image<u8>,
+        motion: &Motion,
+        moving: &Image<bool>,
+        out: &mut DenseMaps,
+    ) {
+        self.run(stack, start, step, Some((motion, moving)), out);
+    }
+
+    fn run(
+        &mut self,
+        stack: &StereoStack<'_>,
+        start: &Image<f32>,
+        step: &Image<u8>,
+        again: Option<(&Motion, &Image<bool>)>,
+        out: &mut DenseMaps,
+    ) {
+        let (width, height) = (stack.width(), stack.height());
         if (self.zero.width(), self.zero.height()) != (width, height) {
             self.zero = Image::new(width, height, 0);
         }
@@ -115,10 +142,14 @@ impl DenseFit {
             fits: if self.shape == ShapeFunction::First { Fits::First } else { Fits::Both },
             surface_px: self.surface_px,
             origin: origin(start),
+            motion: again.map(|(motion, _)| motion),
         };
         let tiles = &self.tiles;
         // Results do not depend on where bands end.
-        let band_rows = height.div_ceil(2 * threads).max(BAND);
+        let band_rows = match again {
+            None => height.div_ceil(2 * threads).max(BAND),
+            Some(_) => BAND,
+        };
         let rows = width * band_rows;
         let DenseMaps { first_px, second_px, zncc } = out;
         first_px
@@ -131,13 +162,33 @@ impl DenseFit {
                 let thread = rayon::current_thread_index().unwrap_or(0) % tiles.len();
                 let mut tile = tiles[thread].lock().unwrap_or_else(|e| e.into_inner());
                 let mut out = Output { first, second, zncc };
-                let strips = width.div_ceil(STRIP);
-                for strip in 0..strips {
-                    let columns = (width * strip / strips, width * (strip + 1) / strips);
-                    tile.run(&job, columns, band * band_rows, &mut out);
+                for (from, to) in columns(width, band, again.map(|(_, moving)| moving)) {
+                    let strips = (to - from).div_ceil(STRIP);
+                    for strip in 0..strips {
+                        let part = |k: usize| from + (to - from) * k / strips;
+                        let columns = (part(strip), part(strip + 1));
+                        tile.run(&job, columns, band * band_rows, &mut out);
+                    }
                 }
             });
     }
+}
+
+/// Ranges of columns of a band that are to be fitted: all, or those of the blocks set in `moving`.
+fn columns(width: usize, band: usize, moving: Option<&Image<bool>>) -> Vec<(usize, usize)> {
+    let Some(moving) = moving else { return vec![(0, width)] };
+    let per_band = BAND / BLOCK;
+    let rows = band * per_band..((band + 1) * per_band).min(moving.height());
+    let set = |column: usize| rows.clone().any(|row| moving.row(row)[column]);
+    let mut ranges: Vec<(usize, usize)> = Vec::new();
+    for column in (0..moving.width()).filter(|&c| set(c)) {
+        let (from, to) = (column * BLOCK, ((column + 1) * BLOCK).min(width));
+        match ranges.last_mut() {
+            Some(last) if last.1 == from => last.1 = to,
+            _ => ranges.push((from, to)),
+        }
+    }
+    ranges
 }
 
 /// A whole number near the mean disparity, subtracted inside for precision.

@@ -12,10 +12,11 @@
 use super::{
     gradient::{Static, static_row},
     moments::{PAD, Powers, horizontal, powers, slide_sum},
+    motion::Motion,
     normalise::{Terms, Windowed, gain_row, product_row, residual_row, restart_row, zncc_row},
     refit::{Window, refit_row},
     solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
-    warp::{Source, Warped, warp_row},
+    warp::{Source, Warped, moving, warp_row},
 };
 use crate::{Image, Level, Sample};
 
@@ -38,6 +39,8 @@ pub(crate) struct Job<'a> {
     pub surface_px: f32,
     /// Subtracted from disparities for precision.
     pub origin: f32,
+    /// Each frame's own place, where the surface moves.
+    pub motion: Option<&'a Motion>,
 }
 
 /// The rows a tile writes: full image rows, of which it fills the columns it was asked for.
@@ -144,6 +147,9 @@ pub(crate) struct Tile {
     sums_again: [Ring; 3],
     fit: [Ring; 2],
     zncc: Ring,
+    /// The rate of the row in work.
+    rate: Vec<f32>,
+    moving: moving::Scratch,
 }
 
 /// A warp's terms, and q with its horizontal moments.
@@ -329,7 +335,9 @@ impl Tile {
             grey: &self.grey[words],
             stride: self.len,
         };
-        warp_row(job.level, &source, &mut self.first.warped(y));
+        let motion =
+            job.motion.and_then(|m| m.of_row(y as usize, (x0, x1), self.len, &mut self.rate));
+        warp(job.level, &source, motion, &mut self.moving, &mut self.first.warped(y));
         let valid = self.first.valid.row(y);
         product_row(job.level, self.l.row(y), valid, self.len, self.l_used.row_mut(y));
         product_row(job.level, self.ll.row(y), valid, self.len, self.ll_used.row_mut(y));
@@ -428,7 +436,10 @@ impl Tile {
                 grey: &self.grey[words],
                 stride: len,
             };
-            warp_row(level, &source, &mut self.second.warped(y));
+            let columns = (x0, (x0 + len).min(job.start.width()));
+            let motion =
+                job.motion.and_then(|m| m.of_row(y as usize, columns, len, &mut self.rate));
+            warp(level, &source, motion, &mut self.moving, &mut self.second.warped(y));
         }
     }
 
@@ -503,6 +514,20 @@ impl Tile {
     }
 }
 
+/// Warps a row, moving or not.
+fn warp(
+    level: Level,
+    source: &Source<'_>,
+    motion: Option<moving::Moving<'_>>,
+    scratch: &mut moving::Scratch,
+    out: &mut Warped<'_>,
+) {
+    match motion {
+        None => warp_row(level, source, out),
+        Some(motion) => moving::warp_moving_row(level, source, &motion, scratch, out),
+    }
+}
+
 /// Asks for the samples that the next row will need: twenty images are more streams than the
 /// processor follows by itself.
 fn prefetch(job: &Job<'_>, y: usize, x0: usize, x1: usize) {
@@ -527,6 +552,6 @@ fn prefetch(job: &Job<'_>, y: usize, x0: usize, x1: usize) {
 }
 
 /// Row `y` of each image.
-fn image_rows<'a>(images: &[&'a Image<Sample>], y: isize) -> [&'a [Sample]; 16] {
+pub(crate) fn image_rows<'a>(images: &[&'a Image<Sample>], y: isize) -> [&'a [Sample]; 16] {
     std::array::from_fn(|i| images.get(i).map_or(&[][..], |image| image.row(y as usize)))
 }

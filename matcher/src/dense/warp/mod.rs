@@ -1,6 +1,7 @@
 //! The warp of one row: the right stack interpolated at x - w(x), and the sums over time of its
 //! products with the left stack.
 
+pub(crate) mod moving;
 mod scalar;
 
 #[cfg(target_arch = "x86_64")]

@@ -13,10 +13,10 @@ use crate::exit::{Failure, Kind};
 use crate::output::Output;
 use crate::reconstruct::{Matching, output_failure};
 
-/// Print accuracy against truth on the simulated sensor: sphere, planes, statue.
+/// Print accuracy against truth on the simulated sensor.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Scenes: sphere, planes, statue [default: all].
+    /// Scenes: sphere, planes, statue, part, moving, turntable [default: the first three].
     scenes: Vec<String>,
     /// Numbers of frames for the sphere.
     #[arg(long, value_delimiter = ',', default_value = "1,3,5,7,10")]
@@ -37,14 +37,18 @@ fn failure(error: &AccuracyError) -> Failure {
 
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
-    let known = ["sphere", "planes", "statue"];
+    let default = ["sphere", "planes", "statue"];
+    let known = [default.as_slice(), &["part", "moving", "turntable"]].concat();
     if let Some(other) = args.scenes.iter().find(|s| !known.contains(&s.as_str())) {
         return Err(Failure::new(
             Kind::Usage,
             format!("scene `{other}`: expected one of {known:?}"),
         ));
     }
-    let wanted = |scene: &str| args.scenes.is_empty() || args.scenes.iter().any(|s| s == scene);
+    let wanted = |scene: &str| match args.scenes.as_slice() {
+        [] => default.contains(&scene),
+        scenes => scenes.iter().any(|s| s == scene),
+    };
     let options = args.matching.options();
     let setting =
         Setting { method: options.method, shape: options.shape, threads: options.threads };
@@ -95,6 +99,24 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         let parabola = Setting { method: Method::Parabola, ..setting };
         for setting in [parabola, setting] {
             measure(&case, "statue", frames, setting)?;
+        }
+    }
+    if wanted("part") {
+        let case = case("part", &[], frames).map_err(|e| failure(&e))?;
+        measure(&case, "part", frames, setting)?;
+    }
+    // The same plane at rest, and away from and towards the sensor.
+    if wanted("moving") {
+        for speed_mm_s in ["0", "9", "-9"] {
+            let options = [("speed_mm_s", speed_mm_s)];
+            let case = case("moving-plane", &options, frames).map_err(|e| failure(&e))?;
+            measure(&case, &format!("plane {speed_mm_s} mm/s"), frames, setting)?;
+        }
+    }
+    if wanted("turntable") {
+        for rpm in ["0", "1.2"] {
+            let case = case("turntable", &[("rpm", rpm)], frames).map_err(|e| failure(&e))?;
+            measure(&case, &format!("turning {rpm} rpm"), frames, setting)?;
         }
     }
     if let Some(folder) = folder {

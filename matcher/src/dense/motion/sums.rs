@@ -1,0 +1,334 @@
+//! The rate's normal equations per block, from every [`ROWS_APART`]th row.
+
+use std::sync::Mutex;
+
+use rayon::prelude::*;
+
+use super::{BLOCK, Motion, Times, lag::Lag};
+use crate::{
+    Image, Level, StereoStack,
+    dense::{
+        DenseMaps,
+        gradient::{SQUARE_UNIT, Static, static_row},
+        tile::image_rows,
+        warp::{Source, Warped, moving, warp_row},
+    },
+    lanes::vectorised,
+};
+
+/// Every how manyth row is summed: dots are taller than half of this.
+const ROWS_APART: usize = 4;
+/// Disparities of a block that spread more than this are of several surfaces.
+const SPREAD_PX: f32 = 6.0;
+/// Fewest pixels of a block that says anything.
+const PIXELS_MIN: f32 = 12.0;
+/// Pixels of a lower ZNCC take no part.
+const ZNCC_MIN: f32 = 0.5;
+/// Variance below which a block counts as dark, per sample in (1/16 grey level)^2.
+const DARK: f32 = 16.0;
+/// Slopes above this are steps.
+const SLOPE_MAX: f32 = 2.0;
+
+/// What the sums are made of.
+#[derive(Clone, Copy)]
+pub(crate) struct Frame<'a> {
+    pub level: Level,
+    pub stack: &'a StereoStack<'a>,
+    pub step: &'a Image<u8>,
+    pub times: &'a Times,
+    pub maps: &'a DenseMaps,
+    /// Radius of the windows that the disparities were fitted in as if nothing moved, if they were.
+    pub smeared: Option<usize>,
+}
+
+/// The rate of a block, in px per unit of [`Times::centred`].
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct Block {
+    /// What the block adds to the rate that its frames were warped with.
+    pub rate: f32,
+    /// Its weight: variance of noise over variance of `rate`; zero where the block says nothing.
+    pub weight: f32,
+    /// Mean disparity of its surface.
+    pub disparity_px: f32,
+}
+
+/// The blocks of an image, row by row.
+#[derive(Debug, Default)]
+pub(crate) struct Blocks {
+    pub columns: usize,
+    pub rows: usize,
+    pub blocks: Vec<Block>,
+    scratch: Vec<Mutex<Scratch>>,
+}
+
+/// Sums over time of a row, and their sums over rows.
+#[derive(Debug, Default)]
+struct Scratch {
+    gradient: Vec<i32>,
+    grey: Vec<i32>,
+    /// Gradients times the frame's time.
+    weighted: Vec<i32>,
+    w: Vec<f32>,
+    rate: Vec<f32>,
+    at: Vec<f32>,
+    terms: [Vec<f32>; TERMS],
+    sums: [Vec<f32>; TERMS + 2],
+    moving: moving::Scratch,
+    lag: Lag,
+}
+
+/// Terms per pixel: n, l, ll, g, gg, il, i, ig, il t, i t, ig t, S, S t, S t^2; the sums also hold
+/// the disparity and its slope.
+const TERMS: usize = 14;
+
+impl Blocks {
+    /// Sums the fit in `frame.maps`, whose frames lie where `motion` says. Without motion, all lie at the
+    /// same place.
+    pub fn sum(&mut self, frame: &Frame<'_>, motion: Option<&Motion>) {
+        let (width, height) = (frame.stack.width(), frame.stack.height());
+        (self.columns, self.rows) = (width.div_ceil(BLOCK), height.div_ceil(BLOCK));
+        self.blocks.resize(self.columns * self.rows, Block::default());
+        let threads = rayon::current_num_threads().max(1);
+        self.scratch.resize_with(threads.max(self.scratch.len()), Mutex::default);
+        let scratch = &self.scratch;
+        self.blocks.par_chunks_mut(self.columns).enumerate().for_each(|(row, blocks)| {
+            let thread = rayon::current_thread_index().unwrap_or(0) % scratch.len();
+            let mut s = scratch[thread].lock().unwrap_or_else(|e| e.into_inner());
+            s.row_of_blocks(frame, motion, row * BLOCK, blocks);
+        });
+    }
+}
+
+impl Scratch {
+    fn resize(&mut self, len: usize, pairs: usize) {
+        for words in [&mut self.gradient, &mut self.grey, &mut self.weighted] {
+            words.resize(len * pairs, 0);
+        }
+        self.w.resize(len, f32::NAN);
+        self.at.resize(len, 0.0);
+        for row in &mut self.terms {
+            row.resize(len, 0.0);
+        }
+        for row in &mut self.sums {
+            row.clear();
+            row.resize(len, 0.0);
+        }
+    }
+
+    fn row_of_blocks(
+        &mut self,
+        frame: &Frame<'_>,
+        motion: Option<&Motion>,
+        top: usize,
+        blocks: &mut [Block],
+    ) {
+        let (width, height) = (frame.stack.width(), frame.stack.height());
+        let frames = frame.stack.frames();
+        let len = width.next_multiple_of(32);
+        self.resize(len, frames.div_ceil(2));
+        let end = (top + BLOCK).min(height);
+        let sampled = (top..end).filter(|y| y % ROWS_APART == ROWS_APART / 2);
+        let surfaces = surfaces(frame, sampled.clone(), blocks.len());
+        let smear = motion.zip(frame.smeared);
+        if let Some((_, radius)) = smear {
+            self.lag.fill(frame, (top, end), radius);
+        }
+        for y in sampled {
+            self.select(frame, y, &surfaces);
+            if let Some((motion, radius)) = smear {
+                self.lag.correct(frame, motion, (y, top), radius, &mut self.w);
+            }
+            self.terms(frame, motion, y);
+            let Self { terms, sums, w, .. } = self;
+            vectorised!(
+                frame.level,
+                add_loop(
+                    terms: &[Vec<f32>; TERMS] = terms,
+                    w: &[f32] = w,
+                    sums: &mut [Vec<f32>; TERMS + 2] = sums,
+                )
+            );
+        }
+        for (column, block) in blocks.iter_mut().enumerate() {
+            let pixels = column * BLOCK..((column + 1) * BLOCK).min(len);
+            let total = |k: usize| self.sums[k][pixels.clone()].iter().map(|&v| f64::from(v)).sum();
+            *block = solve(std::array::from_fn(total), frames);
+        }
+    }
+
+    /// The disparities of row `y` that take part, NaN elsewhere.
+    fn select(&mut self, frame: &Frame<'_>, y: usize, surfaces: &[(f32, f32)]) {
+        self.w.fill(f32::NAN);
+        let rows = frame.maps.first_px.row(y).iter().zip(frame.maps.zncc.row(y));
+        let rows = rows.zip(frame.step.row(y));
+        for (x, (to, ((&d, &zncc), &step))) in self.w.iter_mut().zip(rows).enumerate() {
+            let (low, high) = surfaces[x / BLOCK];
+            let used = step == 0 && zncc >= ZNCC_MIN && d >= low && d <= high;
+            *to = if used { d } else { f32::NAN };
+        }
+    }
+
+    /// Terms of row `y`.
+    fn terms(&mut self, frame: &Frame<'_>, motion: Option<&Motion>, y: usize) {
+        let stack = frame.stack;
+        let frames = stack.frames();
+        let len = self.w.len();
+        let mut zero = Vec::new();
+        if frames % 2 == 1 {
+            zero.resize(stack.width(), 0);
+        }
+        let (mut left, mut right) =
+            (image_rows(stack.left, y as isize), image_rows(stack.right, y as isize));
+        let even = frames.next_multiple_of(2);
+        if frames % 2 == 1 {
+            (left[frames], right[frames]) = (&zero, &zero);
+        }
+        let [n, l, ll, g, gg, il, i, ig, ilt, it, igt, s, st, stt] = &mut self.terms;
+        let (gradient, grey) = (&mut self.gradient[..], &mut self.grey[..]);
+        let mut out = Static { gradient, grey, stride: len, s, il, i, l, ll };
+        static_row(frame.level, &left[..even], 0, len, &mut out);
+        let weighted = &mut self.weighted;
+        vectorised!(
+            frame.level,
+            time_loop(
+                gradient: &[i32] = &self.gradient,
+                grey: &[i32] = &self.grey,
+                times: &[f32; 16] = &frame.times.centred,
+                weighted: &mut [i32] = weighted,
+                sums: [&mut [f32]; 4] = [ilt, it, st, stt],
+            )
+        );
+        // The warp sums products with two stacks: the gradients weighted by time, and plain ones.
+        let (gradient, grey) = (&self.weighted[..], &self.gradient[..]);
+        let source =
+            Source { right: &right[..even], x0: 0, w: &self.w, gradient, grey, stride: len };
+        let mut out = Warped { at: &mut self.at, valid: n, ig: igt, g, gg, lg: ig };
+        let moving = motion.and_then(|m| m.of_row(y, (0, stack.width()), len, &mut self.rate));
+        match moving {
+            None => warp_row(frame.level, &source, &mut out),
+            Some(moving) => {
+                moving::warp_moving_row(frame.level, &source, &moving, &mut self.moving, &mut out);
+            }
+        }
+        for v in ig.iter_mut() {
+            *v *= SQUARE_UNIT;
+        }
+    }
+}
+
+/// Bounds of the disparities of each block's main surface.
+fn surfaces(
+    frame: &Frame<'_>,
+    rows: impl Iterator<Item = usize>,
+    blocks: usize,
+) -> Vec<(f32, f32)> {
+    let mut bounds = vec![(f32::INFINITY, f32::NEG_INFINITY); blocks];
+    let rows: Vec<&[f32]> = rows.map(|y| frame.maps.first_px.row(y)).collect();
+    for row in &rows {
+        for (pixels, (low, high)) in row.chunks(BLOCK).zip(&mut bounds) {
+            for &d in pixels {
+                // NaN loses either comparison.
+                *low = if d < *low { d } else { *low };
+                *high = if d > *high { d } else { *high };
+            }
+        }
+    }
+    let mut all = Vec::new();
+    for (column, (low, high)) in bounds.iter_mut().enumerate() {
+        if *high - *low <= SPREAD_PX {
+            continue;
+        }
+        all.clear();
+        for row in &rows {
+            let end = ((column + 1) * BLOCK).min(row.len());
+            all.extend(row[column * BLOCK..end].iter().filter(|d| !d.is_nan()));
+        }
+        if all.is_empty() {
+            continue;
+        }
+        let middle = all.len() / 2;
+        let (_, median, _) = all.select_nth_unstable_by(middle, f32::total_cmp);
+        (*low, *high) = (*median - SPREAD_PX, *median + SPREAD_PX);
+    }
+    bounds
+}
+
+/// Gradients weighted by the frame's time, rounded; with them i l t, i t, S t, S t^2.
+#[inline(always)]
+fn time_loop(
+    gradient: &[i32],
+    grey: &[i32],
+    times: &[f32; 16],
+    weighted: &mut [i32],
+    sums: [&mut [f32]; 4],
+) {
+    let [ilt, it, st, stt] = sums;
+    let len = ilt.len();
+    let (it, st, stt) = (&mut it[..len], &mut st[..len], &mut stt[..len]);
+    for sum in [&mut *ilt, &mut *it, &mut *st, &mut *stt] {
+        sum.fill(0.0);
+    }
+    let pairs = gradient.chunks_exact(len).zip(grey.chunks_exact(len));
+    for (pair, ((gradient, grey), weighted)) in
+        pairs.zip(weighted.chunks_exact_mut(len)).enumerate()
+    {
+        let (even, odd) = (times[2 * pair], times[2 * pair + 1]);
+        for x in 0..len {
+            let (g0, g1) = (((gradient[x] << 16) >> 16) as f32, (gradient[x] >> 16) as f32);
+            let (l0, l1) = (((grey[x] << 16) >> 16) as f32, (grey[x] >> 16) as f32);
+            // Times are -1..=1: the rounded products fit their halves.
+            let (t0, t1) = ((g0 * even).round_ties_even(), (g1 * odd).round_ties_even());
+            weighted[x] = (t0 as i32 & 0xFFFF) | ((t1 as i32) << 16);
+            ilt[x] += t0 * l0 + t1 * l1;
+            it[x] += t0 + t1;
+            st[x] += t0 * g0 + t1 * g1;
+            stt[x] += t0 * g0 * even + t1 * g1 * odd;
+        }
+    }
+}
+
+#[inline(always)]
+fn add_loop(terms: &[Vec<f32>; TERMS], w: &[f32], sums: &mut [Vec<f32>; TERMS + 2]) {
+    let valid = &terms[0];
+    let (terms_to, rest) = sums.split_at_mut(TERMS);
+    for (to, term) in terms_to.iter_mut().zip(terms) {
+        for ((to, &v), &valid) in to.iter_mut().zip(term).zip(valid) {
+            *to += v * valid;
+        }
+    }
+    let (disparity, slope) = rest.split_at_mut(1);
+    for ((to, &w), &valid) in disparity[0].iter_mut().zip(w).zip(valid) {
+        *to += if valid > 0.5 { w } else { 0.0 };
+    }
+    let inner = slope[0].iter_mut().skip(2).zip(valid.iter().skip(2));
+    for (((to, &valid), &before), &after) in inner.zip(w).zip(w.iter().skip(4)) {
+        let slope = 0.25 * (after - before);
+        // False for NaN: such pixels count as level.
+        let good = slope.abs() < SLOPE_MAX && valid > 0.5;
+        *to += if good { slope } else { 0.0 };
+    }
+}
+
+/// The rate from a block's sums.
+fn solve(sums: [f64; TERMS + 2], frames: usize) -> Block {
+    let [n, l, ll, g, gg, il, i, ig, ilt, it, igt, s, st, stt, w, slope] = sums;
+    if n < f64::from(PIXELS_MIN) {
+        return Block::default();
+    }
+    let samples = n * frames as f64;
+    let unit = f64::from(SQUARE_UNIT);
+    let (variance_l, variance_g) = (ll * unit - l * l / samples, gg * unit - g * g / samples);
+    let dark = f64::from(DARK) * samples;
+    let disparity_px = (w / n) as f32;
+    // The part of S t^2 that a shift of all frames does not explain.
+    let weight = stt - st * st / s;
+    if variance_l < dark || variance_g < dark || weight.is_nan() || weight <= 0.0 {
+        return Block { disparity_px, ..Block::default() };
+    }
+    let ratio = (variance_l / variance_g).sqrt();
+    let offset = (l - ratio * g) / samples;
+    let b = il - offset * i - ratio * ig;
+    let bt = ilt - offset * it - ratio * igt;
+    let rate = -(1.0 - slope / n) * (bt - st / s * b) / weight;
+    Block { rate: rate as f32, weight: weight as f32, disparity_px }
+}
