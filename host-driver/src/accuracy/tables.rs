@@ -158,10 +158,10 @@ impl Case {
         let (mut fit, mut core, mut bias_mm) = ((None, None), (None, None), None);
         if scene.starts_with("sphere") {
             (fit, core) = (sphere(90.0), sphere(CORE_DEG));
-        } else if scene.contains("plane") {
-            if let Ok((rms, bias)) = central_plane_mm(&frame, truth) {
-                (fit.0, bias_mm) = (Some(rms), Some(bias));
-            }
+        } else if scene.contains("plane")
+            && let Ok((rms, bias)) = central_plane_mm(&frame, truth)
+        {
+            (fit.0, bias_mm) = (Some(rms), Some(bias));
         }
         let line = Line {
             scene: scene.to_owned(),

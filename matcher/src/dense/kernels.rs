@@ -48,9 +48,10 @@ impl Kernels {
     }
 
     fn design() -> Kernels {
+        let gradient_exact = gradient_taps();
         let mut taps = [[0i16; TAPS]; PHASES];
         for (phase, out) in taps.iter_mut().enumerate() {
-            let exact = interpolation_taps(phase as f64 / PHASES as f64);
+            let exact = interpolation_taps(phase as f64 / PHASES as f64, gradient_exact);
             for (o, e) in out.iter_mut().zip(&exact) {
                 *o = (e * f64::from(COEFFICIENT_ONE)).round() as i16;
             }
@@ -59,7 +60,6 @@ impl Kernels {
             let largest = (0..TAPS).max_by_key(|&k| out[k].abs()).unwrap_or(3);
             out[largest] += (COEFFICIENT_ONE - sum) as i16;
         }
-        let gradient_exact = gradient_taps();
         let mut gradient = [0i16; 3];
         for (o, e) in gradient.iter_mut().zip(gradient_exact) {
             *o = (e * 32_768.0 / 4.0).round() as i16;
@@ -93,8 +93,12 @@ fn constrained(a: DMatrix<f64>, b: DVector<f64>, g: DVector<f64>) -> DVector<f64
 }
 
 /// The taps for a fraction `tau`: least squares with sum 1, where the shift bias for several dot
-/// sizes, the integral of omega P(omega) Im[response] over that of omega^2 P, is among the errors.
-fn interpolation_taps(tau: f64) -> Vec<f64> {
+/// sizes, the integral of G(omega) P(omega) Im[response] over that of omega G P, is among the errors;
+/// G is the response of the `gradient` that the fit projects on.
+fn interpolation_taps(tau: f64, gradient: [f64; 3]) -> Vec<f64> {
+    let response = |o: f64| -> f64 {
+        gradient.iter().zip(1..).map(|(c, k)| 2.0 * c * (o * f64::from(k)).sin()).sum()
+    };
     let offset = |k: usize| k as f64 - 3.0;
     let mut unit = vec![0.0; TAPS];
     if tau == 0.0 {
@@ -109,9 +113,11 @@ fn interpolation_taps(tau: f64) -> Vec<f64> {
     });
     for sigma in UNBIASED_SIGMA_PX {
         let power = |o: f64| (-(o * sigma).powi(2)).exp();
-        let energy: f64 = folded_nodes().map(|o| o * o * power(o)).sum();
+        let energy: f64 = folded_nodes().map(|o| response(o) * o * power(o)).sum();
         let bias = DVector::from_fn(TAPS, |k, _| {
-            folded_nodes().map(|o| power(o) * o * (o * (offset(k) - tau)).sin()).sum::<f64>()
+            folded_nodes()
+                .map(|o| power(o) * response(o) * (o * (offset(k) - tau)).sin())
+                .sum::<f64>()
                 / energy
         });
         a += &bias * bias.transpose() * BIAS_WEIGHT;
@@ -163,17 +169,16 @@ mod tests {
                             .map(|j| f64::from(k.taps[phase][j]) * dot(x + j as f64 - 3.0))
                             .sum::<f64>()
                             / f64::from(COEFFICIENT_ONE);
+                        // As the fit takes it from the reference, whose samples lie at x + tau.
                         let gradient: f64 = (0..3)
                             .map(|j| {
                                 let o = (j + 1) as f64;
-                                k.gradient_exact[j] * (dot(x + o) - dot(x - o))
+                                k.gradient_exact[j] * (dot(x + tau + o) - dot(x + tau - o))
                             })
                             .sum();
-                        // The gradient of the reference, a pixel fraction away.
                         let reference = -(x + tau - c) / (sigma * sigma) * dot(x + tau);
-                        cross += reference * (at - dot(x + tau));
-                        energy += reference * reference;
-                        assert!(gradient.is_finite());
+                        cross += gradient * (at - dot(x + tau));
+                        energy += gradient * reference;
                     }
                 }
                 let bias = cross / energy;
