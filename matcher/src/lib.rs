@@ -2,7 +2,7 @@
 //!
 //! Data flow: a [`StereoStack`] of N rectified pairs goes through census, Hamming cost, winner takes
 //! all, parabola, reliability retry, left-right check, sub-pixel refinement by Stereo-DIC, growth into
-//! the gaps, and comes out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
+//! the gaps, the verdict on pixels at depth steps, and comes out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
 
 pub mod bspline;
 pub mod census;
@@ -25,6 +25,7 @@ pub mod regions;
 pub mod retry;
 pub mod search;
 pub mod stack;
+pub mod step;
 pub mod synthetic;
 pub mod wta;
 pub mod zncc;

@@ -143,7 +143,7 @@ impl Matcher {
         self.map.fill(&coarse.disparity_px);
         clock.stage("prepare");
         let Self { field, prepared, map, order, params, level, .. } = self;
-        field.refine(prepared, map, stack.left_mask, params, *level);
+        field.refine(prepared, map, stack, params, *level);
         clock.stage("icgn");
         let (mut disparity_px, mut zncc) = (field.disparity_px(), field.zncc());
         if params.shape == ShapeFunction::Auto {

@@ -7,7 +7,10 @@
 use rayon::prelude::*;
 
 use super::{Refined, Refiner, guess::CoarseMap, prepare::Prepared, shape::Shape, window::Window};
-use crate::{Image, Level, Params, ShapeFunction};
+use crate::{
+    Image, Level, Params, ShapeFunction, StereoStack,
+    step::{StepJudge, Verdict},
+};
 
 /// Columns and rows that a task works through together: their subsets share cache lines.
 const TILE: usize = 64;
@@ -56,15 +59,18 @@ pub struct Field {
     width: usize,
     height: usize,
     points: Vec<Estimate>,
+    /// Made by the first stack.
+    judge: Option<StepJudge>,
 }
 
 impl Field {
-    /// Refines every pixel with a coarse disparity, then grows. `map` becomes the refined disparity.
+    /// Refines every pixel with a coarse disparity, grows, and settles depth steps. `map` becomes the
+    /// refined disparity.
     pub fn refine(
         &mut self,
         prepared: &Prepared,
         map: &mut CoarseMap,
-        left_mask: Option<&Image<u8>>,
+        stack: &StereoStack<'_>,
         params: &Params,
         level: Level,
     ) {
@@ -79,7 +85,73 @@ impl Field {
                 map.set(x, y, -point.shape[0]);
             }
         }
-        self.grow(&refiner, map, left_mask);
+        self.grow(&refiner, map, stack.left_mask);
+        self.settle_steps(&refiner, map, stack, level);
+    }
+
+    /// Lets the pixels' own grey values decide at depth steps, and fits the subsets there once more,
+    /// now with only the pixels that were found to be on their surface.
+    fn settle_steps(
+        &mut self,
+        refiner: &Refiner<'_>,
+        map: &mut CoarseMap,
+        stack: &StereoStack<'_>,
+        level: Level,
+    ) {
+        let width = self.width;
+        let mut disparity_px = self.disparity_px();
+        let mut verdicts = Image::new(width, self.height, Verdict::Kept);
+        let judge = self.judge.get_or_insert_with(|| StepJudge::new(level));
+        judge.judge(stack, &mut disparity_px, &mut verdicts);
+        let moved = |i: usize| verdicts.as_slice()[i] == Verdict::Moved;
+        for (i, &verdict) in verdicts.as_slice().iter().enumerate() {
+            if verdict != Verdict::Kept {
+                self.points[i] = Estimate::NONE;
+                map.set(i % width, i / width, disparity_px.as_slice()[i]);
+            }
+        }
+        let near = judge.near();
+        let open: Vec<u32> = (0..self.points.len() as u32)
+            .into_par_iter()
+            .filter(|&i| {
+                near.as_slice()[i as usize] != 0
+                    && (moved(i as usize) || !self.points[i as usize].is_none())
+            })
+            .collect();
+        let fitted: Vec<(u32, Estimate)> = open
+            .par_iter()
+            .map_init(Window::empty, |part, &i| {
+                let at = i as usize;
+                let start = if moved(at) {
+                    self.continued(at, disparity_px.as_slice()[at], refiner.surface_px)
+                } else {
+                    self.points[at].moved(0.0, 0.0)
+                };
+                let refined = refiner.refit(map, at % width, at / width, start, part);
+                (i, refined.map_or(self.points[at], Estimate::from))
+            })
+            .collect();
+        for (i, point) in fitted {
+            let at = i as usize;
+            self.points[at] = point;
+            map.set(at % width, at / width, -point.shape[0]);
+        }
+    }
+
+    /// The shape at a pixel that was given to the surface of `disparity_px`: a neighbour's on that
+    /// surface, the most similar one, or a level one.
+    fn continued(&self, i: usize, disparity_px: f32, surface_px: f32) -> Shape {
+        let mut best = Estimate::NONE;
+        let mut start = Shape([-disparity_px as f64, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        for (j, dx, dy) in self.neighbours(i) {
+            let point = self.points[j];
+            let better = best.is_none() || point.zncc > best.zncc;
+            let shape = point.moved(dx as f64, dy as f64);
+            if better && (shape.0[0] + disparity_px as f64).abs() <= surface_px as f64 {
+                (best, start) = (point, shape);
+            }
+        }
+        start
     }
 
     /// First-order estimates of the refined points, from their second-order ones; those themselves

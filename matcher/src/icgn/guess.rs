@@ -131,8 +131,7 @@ impl Guesser {
             } else {
                 (known - (px as f64 - warped)).abs() <= self.surface_px as f64 || (dx, dy) == (0, 0)
             };
-            let column = warped.floor() as i64;
-            member && prepared.right_is_inside(py as usize, column, column + 1)
+            member && prepared.right_sees(py as usize, warped)
         });
     }
 
@@ -240,8 +239,8 @@ impl Guesser {
         part.select(self.radius, prepared, |dx, dy| {
             let (r, c) = self.index(dx, dy);
             member[r][c] && {
-                let column = (x as f64 + shape.warp(dx as f64, dy as f64)).floor() as i64;
-                prepared.right_is_inside((y as i64 + dy as i64) as usize, column, column + 1)
+                let warped = x as f64 + shape.warp(dx as f64, dy as f64);
+                prepared.right_sees((y as i64 + dy as i64) as usize, warped)
             }
         });
         // Fewer pixels than this cannot carry the parameters.

@@ -104,6 +104,25 @@ impl<'a> Refiner<'a> {
         (near && self.belongs(map, x, y, &refined, part)).then_some(refined)
     }
 
+    /// Refines the point (x, y) at a depth step once more, over the pixels that `map` has on its
+    /// surface.
+    fn refit(
+        &self,
+        map: &CoarseMap,
+        x: usize,
+        y: usize,
+        start: Shape,
+        part: &mut Window,
+    ) -> Option<Refined> {
+        self.guesser.select_near(map, self.prepared, (x, y), &start, part);
+        if part.count() < 2 * self.guesser.radius() + 1 {
+            return None;
+        }
+        let refined = self.refine(part, x, y, start)?;
+        let near = (refined.shape.0[0] - start.0[0]).abs() <= GROWTH_STEP_PX;
+        (near && refined.zncc >= self.zncc_min).then_some(refined)
+    }
+
     /// The first-order estimate of a point whose second-order one is `shape`, where the whole square
     /// belongs to the surface: elsewhere there is nothing to choose between.
     fn first_order(&self, map: &CoarseMap, x: usize, y: usize, shape: Shape) -> Option<Refined> {
@@ -217,12 +236,10 @@ impl<'a> Refiner<'a> {
                 && (0..self.prepared.height as i64).contains(&py);
             inside && {
                 let warped = x as f64 + shape.warp(dx as f64, dy as f64);
-                let column = warped.floor() as i64;
                 let known = map.at(px as usize, py as usize);
                 // A neighbour of another surface says nothing about this one.
                 let other = (known as f64 - (px as f64 - warped)).abs() > self.surface_px as f64;
-                (!other || (dx, dy) == (0, 0))
-                    && self.prepared.right_is_inside(py as usize, column, column + 1)
+                (!other || (dx, dy) == (0, 0)) && self.prepared.right_sees(py as usize, warped)
             }
         });
         if scratch.count() == 0 {

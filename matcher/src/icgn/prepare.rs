@@ -32,6 +32,9 @@ pub enum Sum {
     LL = 4,
 }
 
+/// Pixels outside a mask that reflect those inside; beyond, nothing reaches back into it.
+const REFLECTED: usize = 4;
+
 /// Number of [`Sum`]s.
 pub const SUMS: usize = 5;
 
@@ -117,6 +120,12 @@ impl Prepared {
         self.width + 2 * MARGIN
     }
 
+    /// Whether the right camera saw position `at` of row `y`: to half a pixel beyond its last one.
+    pub(crate) fn right_sees(&self, y: usize, at: f64) -> bool {
+        let column = (at + 0.5).floor() as i64;
+        self.right_is_inside(y, column, column)
+    }
+
     /// Whether the right columns `first..=last` of row `y` are all inside the image and its mask.
     pub(crate) fn right_is_inside(&self, y: usize, first: i64, last: i64) -> bool {
         if first < 0 || last >= self.width as i64 || last < first {
@@ -129,8 +138,9 @@ impl Prepared {
     }
 }
 
-/// Puts the frames of row `y` side by side. Pixels outside the mask get the value of the nearest one
-/// inside: what they held never enters a filter.
+/// Puts the frames of row `y` side by side. Pixels outside the mask continue those inside by a
+/// reflection about the border's own value, which keeps the slope there: what they held never enters a
+/// filter.
 fn interleave(frames: &[&Image<Sample>], mask: Option<&Image<u8>>, y: usize, out: &mut [f32]) {
     let (pixels, _) = out.as_chunks_mut::<LANES>();
     for (t, frame) in frames.iter().enumerate() {
@@ -145,13 +155,22 @@ fn interleave(frames: &[&Image<Sample>], mask: Option<&Image<u8>>, y: usize, out
     let Some(first) = mask.iter().position(|&m| m != 0) else {
         return pixels.iter_mut().for_each(|p| p.fill(0.0));
     };
-    let mut nearest = pixels[first];
-    for (pixel, &m) in pixels.iter_mut().zip(mask) {
-        if m != 0 {
-            nearest = *pixel;
-        } else {
-            *pixel = nearest;
+    let mut border = first;
+    for x in 0..pixels.len() {
+        if mask[x] != 0 {
+            border = x;
+            continue;
         }
+        let (edge, distance) = (pixels[border], border.abs_diff(x).min(REFLECTED));
+        // To the left of the first border, and to the right of the others.
+        let inner = if x < border { border + distance } else { border.wrapping_sub(distance) };
+        pixels[x] = match mask.get(inner) {
+            Some(&m) if m != 0 => {
+                let inner = pixels[inner];
+                std::array::from_fn(|t| 2.0 * edge[t] - inner[t])
+            }
+            _ => edge,
+        };
     }
 }
 

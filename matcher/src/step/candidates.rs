@@ -1,0 +1,89 @@
+//! The surfaces that a pixel could show.
+
+use super::JUMP_PX;
+use crate::Image;
+
+/// How far another surface is looked for: beyond the width of fattening, and one more.
+const REACH: usize = 4;
+
+/// Candidates that differ by less are one.
+const SAME_PX: f32 = 1.0;
+
+/// A surface near a pixel, continued to it as a plane.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Candidate {
+    /// Disparity at the pixel.
+    pub disparity_px: f32,
+    /// Its change per column and row.
+    pub slope: [f32; 2],
+}
+
+impl Candidate {
+    /// Disparity of the plane at an offset from the pixel.
+    pub fn at(&self, dx: i32, dy: i32) -> f32 {
+        self.disparity_px + self.slope[0] * dx as f32 + self.slope[1] * dy as f32
+    }
+}
+
+/// Up to four other surfaces around a pixel.
+#[derive(Debug, Default)]
+pub(crate) struct Candidates {
+    found: [Option<Candidate>; 4],
+}
+
+impl Candidates {
+    /// Looks along the four axes from (x, y), whose own surface is `own`, for the first pixel of
+    /// another surface.
+    pub fn around(map: &Image<f32>, x: usize, y: usize, own: &Candidate) -> Self {
+        let mut candidates = Self::default();
+        for (k, (sx, sy)) in [(-1, 0), (1, 0), (0, -1), (0, 1)].into_iter().enumerate() {
+            for step in 1..=REACH as i32 {
+                let (dx, dy) = (sx * step, sy * step);
+                let (Some(px), Some(py)) =
+                    (x.checked_add_signed(dx as isize), y.checked_add_signed(dy as isize))
+                else {
+                    break;
+                };
+                let Some(value) = map.get(px, py) else { break };
+                // NaN is not far from anything.
+                let other = (value - own.at(dx, dy)).abs() > JUMP_PX;
+                if !other {
+                    continue;
+                }
+                let plane = plane(map, px, py, value);
+                let continued = plane.at(-dx, -dy);
+                let candidate = Candidate { disparity_px: continued, ..plane };
+                let known = candidates.iter().any(|c| (c.disparity_px - continued).abs() < SAME_PX);
+                let same = (continued - own.disparity_px).abs() < SAME_PX;
+                if !known && !same {
+                    candidates.found[k] = Some(candidate);
+                }
+                break;
+            }
+        }
+        candidates
+    }
+
+    pub fn iter(&self) -> impl Iterator<Item = &Candidate> {
+        self.found.iter().flatten()
+    }
+}
+
+/// The plane through (x, y) with the slopes to its neighbours two pixels away that are on the same
+/// surface; level where there are none.
+pub(crate) fn plane(map: &Image<f32>, x: usize, y: usize, value: f32) -> Candidate {
+    let slope = |sx: isize, sy: isize| {
+        let side = |sign: isize| {
+            let px = x.checked_add_signed(2 * sign * sx)?;
+            let py = y.checked_add_signed(2 * sign * sy)?;
+            let difference = (map.get(px, py)? - value) * (0.5 * sign as f32);
+            (difference.abs() <= JUMP_PX).then_some(difference)
+        };
+        match (side(-1), side(1)) {
+            (Some(a), Some(b)) => 0.5 * (a + b),
+            (Some(a), None) | (None, Some(a)) => a,
+            (None, None) => 0.0,
+        }
+    };
+    Candidate { disparity_px: value, slope: [slope(1, 0), slope(0, 1)] }
+}
