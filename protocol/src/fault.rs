@@ -34,11 +34,19 @@ pub enum FaultReason {
     HardFault = 10,
     /// A debugger halted the processor while armed or running.
     DebugHalt = 11,
+    /// The DMA that makes the edges of gates and triggers stopped during a run. Value and limit: edges
+    /// made and edges planned. Since 1.1.
+    EdgeDma = 12,
+    /// The firmware is for another board than it runs on. Value and limit: 1 where there is, 1 where
+    /// there should be a USB device core. Since 1.1.
+    WrongBoard = 13,
+    /// The crystal stopped while the firmware ran. Since 1.1.
+    Clock = 14,
 }
 
 impl FaultReason {
     /// All reasons, in bit order.
-    pub const ALL: [FaultReason; 12] = [
+    pub const ALL: [FaultReason; 15] = [
         FaultReason::Interlock,
         FaultReason::HeartbeatLost,
         FaultReason::OverTemperature,
@@ -51,7 +59,25 @@ impl FaultReason {
         FaultReason::Panic,
         FaultReason::HardFault,
         FaultReason::DebugHalt,
+        FaultReason::EdgeDma,
+        FaultReason::WrongBoard,
+        FaultReason::Clock,
     ];
+
+    /// The first minor of protocol 1 that has this reason.
+    #[must_use]
+    pub const fn since_minor(self) -> u16 {
+        match self {
+            FaultReason::EdgeDma | FaultReason::WrongBoard | FaultReason::Clock => 1,
+            _ => 0,
+        }
+    }
+
+    /// The reason as a host of protocol 1.`minor` knows it: what came later is to it the engine's.
+    #[must_use]
+    pub const fn as_of(self, minor: u16) -> Self {
+        if self.since_minor() > minor { FaultReason::Engine } else { self }
+    }
 
     /// What happened, in words.
     #[must_use]
@@ -69,6 +95,9 @@ impl FaultReason {
             FaultReason::Panic => "firmware panic",
             FaultReason::HardFault => "processor fault",
             FaultReason::DebugHalt => "halted by a debugger",
+            FaultReason::EdgeDma => "edge DMA stopped",
+            FaultReason::WrongBoard => "firmware of another board",
+            FaultReason::Clock => "crystal stopped",
         }
     }
 }

@@ -31,6 +31,7 @@ pub mod message;
 pub mod reply;
 pub mod request;
 pub mod timing;
+pub mod trigger;
 pub mod units;
 pub mod usb;
 pub mod version;

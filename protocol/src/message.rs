@@ -14,9 +14,10 @@ use crate::reply::{
 };
 use crate::request::{
     Arm, ClearFaults, Disarm, FloodlightOff, FloodlightOn, GetFaults, GetInfo, GetStatus,
-    GetTiming, Heartbeat, Hello, LoadDefaults, LoadSettings, RebootToBootloader, Reset,
-    SaveSettings, SetTiming, StartBurst, StartStream, StopStream,
+    GetTiming, GetTriggerSource, Heartbeat, Hello, LoadDefaults, LoadSettings, RebootToBootloader,
+    Reset, SaveSettings, SetTiming, SetTriggerSource, StartBurst, StartStream, StopStream,
 };
+use crate::trigger::TriggerInput;
 use crate::version::DeviceInfo;
 use crate::wire::{DecodeError, EncodeError, Frame, encode_frame};
 
@@ -256,6 +257,10 @@ messages! {
             "Restart the controller after the reply.";
         0x14 reboot_to_bootloader: RebootToBootloader => Done,
             "Restart into the bootloader after the reply.";
+        0x15 set_trigger_source: SetTriggerSource   => Done,
+            "Choose what starts slots: the gate timer, or edges at trigger-in (since 1.1).";
+        0x16 get_trigger_source: GetTriggerSource   => TriggerInput,
+            "What starts slots, and the edges seen (since 1.1).";
     }
     events {
         0x40 TriggerEvent, "One camera trigger: labels the frame of each camera.";

@@ -135,6 +135,8 @@ pub enum RequestField {
     FloodlightDurationUs,
     /// [`RebootToBootloader::key`](crate::request::RebootToBootloader::key).
     BootloaderKey,
+    /// [`ExternalTrigger::delay_us`](crate::trigger::ExternalTrigger::delay_us). Since 1.1.
+    TriggerDelayUs,
 }
 
 /// What went wrong with the settings store.
@@ -237,6 +239,7 @@ impl fmt::Display for RequestError {
                     RequestField::BurstFrames => "frames",
                     RequestField::FloodlightDurationUs => "duration_us",
                     RequestField::BootloaderKey => "key",
+                    RequestField::TriggerDelayUs => "delay_us",
                 };
                 write!(f, "{name} is {value}; allowed is {min}..={max}")
             }

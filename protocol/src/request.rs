@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::timing::ProjectionTiming;
+use crate::trigger::TriggerSource;
 use crate::version::ProtocolVersion;
 
 /// Starts a session: streaming stops, the device disarms, and messages of the host's version follow.
@@ -108,6 +109,18 @@ pub struct RebootToBootloader {
     /// [`BOOTLOADER_KEY`], against accidents.
     pub key: u32,
 }
+
+/// Chooses what starts the slots of the runs to come. Refused while running, and without
+/// [`Capabilities::TRIGGER_IN`](crate::version::Capabilities::TRIGGER_IN). Since 1.1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SetTriggerSource {
+    /// What starts slots.
+    pub source: TriggerSource,
+}
+
+/// Asks what starts slots, and for the count of edges. Since 1.1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GetTriggerSource;
 
 /// Key that [`RebootToBootloader`] must carry.
 pub const BOOTLOADER_KEY: u32 = 0xB007_10AD;

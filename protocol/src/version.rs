@@ -10,7 +10,10 @@
 //!   a host sends an added message only where the device's bit is set; a device that is older than the
 //!   host answers an id that it does not know with
 //!   [`RequestError::UnknownMessage`](crate::reply::RequestError::UnknownMessage); a host that is older
-//!   than the device skips events of unknown id and ignores unknown capability and fault bits.
+//!   than the device skips events of unknown id and ignores unknown capability and fault bits. A new
+//!   value of an enumeration is a change of layout: it goes only to a host whose `Hello` names a minor
+//!   that has it ([`FaultReason::since_minor`](crate::fault::FaultReason::since_minor)), or in answer to
+//!   a message of that minor.
 //! * Frozen over all majors: the framing, the layout of `Hello`, and that of the two errors named above.
 
 use serde::{Deserialize, Serialize};
@@ -18,8 +21,9 @@ use serde::{Deserialize, Serialize};
 use crate::fault::FaultSet;
 use crate::timing::Limits;
 
-/// The protocol that this crate speaks.
-pub const PROTOCOL_VERSION: ProtocolVersion = ProtocolVersion { major: 1, minor: 0 };
+/// The protocol that this crate speaks. Since 1.0: trigger-in ([`crate::trigger`]) and three fault
+/// reasons.
+pub const PROTOCOL_VERSION: ProtocolVersion = ProtocolVersion { major: 1, minor: 1 };
 
 /// Version of the protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -151,6 +155,9 @@ impl Capabilities {
     pub const FLOODLIGHT: Self = Self(1 << 3);
     /// The temperature at the projectors is measured.
     pub const TEMPERATURE: Self = Self(1 << 4);
+    /// There is a trigger input: [`SetTriggerSource`](crate::request::SetTriggerSource) and
+    /// [`GetTriggerSource`](crate::request::GetTriggerSource) are served. Since 1.1.
+    pub const TRIGGER_IN: Self = Self(1 << 5);
 
     /// Whether every bit of `other` is set.
     #[must_use]

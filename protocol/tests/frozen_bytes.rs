@@ -1,4 +1,5 @@
-//! Every message, byte for byte, as it went over the wire in protocol 1.0.
+//! Every message, byte for byte, as it went over the wire in protocol 1.0; what a minor added has its
+//! number in the name.
 //!
 //! These bytes never change within a major version. A change here is a new major, or a mistake.
 
@@ -10,6 +11,7 @@ use stspp_protocol::message::{Event, FromDevice, MESSAGE_TABLE, Reply, Request, 
 use stspp_protocol::reply::*;
 use stspp_protocol::request::*;
 use stspp_protocol::timing::{Limits, ProjectionTiming, Slot, TimingError, TimingField};
+use stspp_protocol::trigger::{ExternalTrigger, TriggerEdge, TriggerInput, TriggerSource};
 use stspp_protocol::version::*;
 use stspp_protocol::wire::{FrameDecoder, MAX_FRAME_LEN};
 
@@ -62,6 +64,10 @@ fn report() -> FaultReport {
     }
 }
 
+fn external() -> TriggerSource {
+    TriggerSource::External(ExternalTrigger { edge: TriggerEdge::Falling, delay_us: 250 })
+}
+
 fn requests() -> Vec<(Request, &'static str)> {
     vec![
         (Request::Hello(Hello { host: ProtocolVersion { major: 1, minor: 0 } }), "REQ_HELLO"),
@@ -87,6 +93,12 @@ fn requests() -> Vec<(Request, &'static str)> {
             Request::RebootToBootloader(RebootToBootloader { key: BOOTLOADER_KEY }),
             "REQ_REBOOT_TO_BOOTLOADER",
         ),
+        (Request::SetTriggerSource(SetTriggerSource { source: external() }), "REQ_SET_TRIGGER_1_1"),
+        (
+            Request::SetTriggerSource(SetTriggerSource { source: TriggerSource::FreeRunning }),
+            "REQ_SET_TRIGGER_FREE_1_1",
+        ),
+        (Request::GetTriggerSource(GetTriggerSource), "REQ_GET_TRIGGER_1_1"),
     ]
 }
 
@@ -129,6 +141,15 @@ fn replies() -> Vec<(Reply, &'static str)> {
         (Reply::LoadDefaults(active()), "REP_LOAD_DEFAULTS"),
         (Reply::Reset(Done), "REP_RESET"),
         (Reply::RebootToBootloader(Done), "REP_REBOOT_TO_BOOTLOADER"),
+        (Reply::SetTriggerSource(Done), "REP_SET_TRIGGER_1_1"),
+        (
+            Reply::GetTriggerSource(TriggerInput {
+                source: external(),
+                edges_taken: 300,
+                edges_ignored: 2,
+            }),
+            "REP_GET_TRIGGER_1_1",
+        ),
     ]
 }
 
@@ -160,6 +181,27 @@ fn events() -> Vec<(Event, &'static str)> {
             "EVT_TRIGGER_F330",
         ),
         (Event::FaultEvent(FaultEvent { record: record(), latched: FaultSet(0x04) }), "EVT_FAULT"),
+        (
+            Event::FaultEvent(FaultEvent {
+                record: FaultRecord { reason: FaultReason::EdgeDma, ..record() },
+                latched: FaultSet(0x1004),
+            }),
+            "EVT_FAULT_EDGE_DMA_1_1",
+        ),
+        (
+            Event::FaultEvent(FaultEvent {
+                record: FaultRecord { reason: FaultReason::WrongBoard, ..record() },
+                latched: FaultSet(0x2000),
+            }),
+            "EVT_FAULT_WRONG_BOARD_1_1",
+        ),
+        (
+            Event::FaultEvent(FaultEvent {
+                record: FaultRecord { reason: FaultReason::Clock, ..record() },
+                latched: FaultSet(0x4000),
+            }),
+            "EVT_FAULT_CLOCK_1_1",
+        ),
         (Event::StateEvent(state), "EVT_STATE"),
         (
             Event::TimingEvent(TimingEvent { timing_generation: 3, first_frame_sequence: 70_020 }),
@@ -206,6 +248,15 @@ fn errors() -> Vec<(RequestError, &'static str)> {
                 max: 500_000,
             },
             "ERR_OUT_OF_RANGE",
+        ),
+        (
+            RequestError::OutOfRange {
+                field: RequestField::TriggerDelayUs,
+                value: 10,
+                min: 60,
+                max: 900,
+            },
+            "ERR_TRIGGER_DELAY_1_1",
         ),
         (RequestError::DutyBudget { emitter: 10, retry_after_us: 12_345 }, "ERR_DUTY_BUDGET"),
         (RequestError::Storage(StorageError::Write), "ERR_STORAGE"),

@@ -101,7 +101,8 @@ pub fn build(toolchain: &Toolchain, board: &str) -> Result<Image, String> {
     cargo
         .current_dir(firmware())
         .args(["build", "--release", "--locked", "--target", TARGET, "-p", "stspp-firmware"])
-        .args(["--features", &format!("board-{board}")]);
+        .args(["--features", &format!("board-{board}")])
+        .args(["--config", &short_paths()?]);
     toolchain.finish(&mut cargo);
     done(&mut cargo, "the firmware does not build")?;
 
@@ -113,6 +114,25 @@ pub fn build(toolchain: &Toolchain, board: &str) -> Result<Image, String> {
     let bytes = std::fs::read(&elf).map_err(|e| format!("{}: {e}", elf.display()))?;
     let (flash, ram) = elf::sizes(&bytes).map_err(|e| format!("{}: {e}", elf.display()))?;
     Ok(Image { elf, flash, ram })
+}
+
+/// Paths of sources go into the image (panics name them): cut to what is the same on every machine,
+/// so that the image is too. The configuration's own flags stay, since cargo joins lists.
+fn short_paths() -> Result<String, String> {
+    let home = std::env::var_os("CARGO_HOME")
+        .map(PathBuf::from)
+        .or_else(|| std::env::home_dir().map(|home| home.join(".cargo")));
+    let mut folders = vec![workspace::root().to_path_buf()];
+    if let Some(sources) = home.map(|home| home.join("registry/src")) {
+        let entries = std::fs::read_dir(&sources).into_iter().flatten().flatten();
+        folders.extend(entries.map(|entry| entry.path()));
+    }
+    let flags: Vec<String> = folders
+        .iter()
+        .map(|folder| format!("--remap-path-prefix={}/=", folder.display()))
+        .collect();
+    let flags = serde_json::to_string(&flags).map_err(|e| e.to_string())?;
+    Ok(format!("target.{TARGET}.rustflags={flags}"))
 }
 
 fn describe(board: &str, image: &Image) -> String {

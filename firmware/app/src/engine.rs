@@ -1,17 +1,18 @@
 //! The gate engine on the chip: the logic's [`Runner`] over the HAL's timed port writes.
 
-use crate::{board, safety, shared};
+use crate::{board, safety, shared, trigger_in};
 use core::cell::RefCell;
 use critical_section::Mutex;
 use embassy_gd32f3x0::calc::chain::Edge as PortEdge;
-use embassy_gd32f3x0::guard;
 use embassy_gd32f3x0::sequence::Sequence;
+use embassy_gd32f3x0::{exti, guard};
 use embassy_time::Instant;
 use heapless::{Deque, Vec};
 use static_cell::StaticCell;
-use stspp_firmware_logic::hardware::{Aborted, GateEngine, SlotDone};
+use stspp_firmware_logic::hardware::{Aborted, GateEngine, SlotDone, TriggerEdges};
 use stspp_firmware_logic::runner::{Edge, EdgeQueue, Effect, Refused, Runner, SLOT_EDGES};
 use stspp_firmware_logic::timing::{GateWord, SlotPlan};
+use stspp_protocol::trigger::{TriggerEdge, TriggerSource};
 
 /// Slots that can wait for the controller; more than that, and it sees the gap as a fault.
 const REPORTS: usize = 16;
@@ -26,6 +27,7 @@ struct Core {
     queue: PortQueue,
     runner: Runner,
     reports: Deque<SlotDone, REPORTS>,
+    trigger_in: exti::RawLine,
 }
 
 /// Shared by [`Engine`] (thread mode) and the edge interrupt.
@@ -38,12 +40,16 @@ fn with_core<R>(f: impl FnOnce(&mut Core) -> R) -> R {
     })
 }
 
-/// Takes the hardware.
-pub(crate) fn install(sequence: Sequence<'static>) {
-    // In .bss, not in initialised data.
+/// Takes the hardware: the edges' and trigger-in's.
+pub(crate) fn install(sequence: Sequence<'static>, trigger_in: exti::RawLine) {
+    // In .bss, not in initialised data, and made there, not on the stack.
     static PLACE: StaticCell<Core> = StaticCell::new();
-    let queue = PortQueue { sequence };
-    let core = PLACE.init(Core { queue, runner: Runner::new(), reports: Deque::new() });
+    let core = PLACE.init_with(|| Core {
+        queue: PortQueue { sequence },
+        runner: Runner::new(),
+        reports: Deque::new(),
+        trigger_in,
+    });
     critical_section::with(|cs| {
         CORE.replace(cs, Some(core));
     });
@@ -57,7 +63,7 @@ pub(crate) fn take_report() -> Option<SlotDone> {
 /// After an edge; TIMER1's interrupt calls it.
 pub(crate) fn on_edge() {
     let wake = with_core(|core| {
-        let Core { queue, runner, reports } = core;
+        let Core { queue, runner, reports, .. } = core;
         if safety::is_cut() || !runner.is_running() {
             // A floodlight pulse outside of a run, or the end of everything.
             if board::lit_pins() == 0 {
@@ -86,6 +92,26 @@ pub(crate) fn on_edge() {
     if wake {
         shared::WAKE.signal(());
     }
+}
+
+/// An edge at trigger-in, and more that came too close to it; the software interrupt calls it.
+pub(crate) fn on_trigger_edge(at_us: u64, more: u32) {
+    with_core(|core| {
+        if !safety::is_cut() {
+            core.runner.on_trigger_edge(at_us, more, &mut core.queue);
+        }
+    });
+}
+
+/// What the supervisor looks at every round: trigger-in is listened to while a run waits for it.
+/// Returns how many edges were made and how many planned, where the DMA has stopped by itself.
+pub(crate) fn tend() -> Option<(u32, u32)> {
+    with_core(|core| {
+        let cut = safety::is_cut();
+        trigger_in::listen(core.runner.waits_for_edge() && !cut);
+        let stopped = core.runner.is_running() && !cut && !core.queue.sequence.is_running();
+        stopped.then(|| (core.queue.sequence.happened(), core.queue.sequence.appended()))
+    })
 }
 
 /// The HAL's sequence as the runner's queue.
@@ -138,7 +164,9 @@ impl GateEngine for Engine {
         with_core(|core| {
             guard::disarm();
             core.reports.clear();
-            core.runner.start(slots, &mut core.queue)
+            let start_us = core.runner.start(slots, &mut core.queue);
+            trigger_in::listen(core.runner.waits_for_edge());
+            start_us
         })
     }
 
@@ -186,5 +214,21 @@ impl GateEngine for Engine {
 
     fn floodlight_is_on(&self) -> bool {
         board::floodlight_is_on()
+    }
+
+    fn set_trigger_source(&mut self, source: TriggerSource) {
+        with_core(|core| {
+            core.runner.set_trigger_source(source);
+            if let TriggerSource::External(external) = source {
+                core.trigger_in.select(match external.edge {
+                    TriggerEdge::Rising => exti::Edge::Rising,
+                    TriggerEdge::Falling => exti::Edge::Falling,
+                });
+            }
+        });
+    }
+
+    fn trigger_edges(&self) -> TriggerEdges {
+        with_core(|core| core.runner.trigger_edges())
     }
 }

@@ -28,6 +28,7 @@
 //! | TIMER1 + DMA 0, 3 | every edge | guard (TIMER0 + DMA 4) switches off after the longest on-time |
 //! | edge interrupt, P1 | commits the next slot | at most the committed slot is played, then dark |
 //! | interlock interrupt, P0 | stops DMA, all outputs low, at once | supervisor sees the level 5 ms later |
+//! | trigger-in, P0, P1 | notes the edge, commits its slot | no slot, no light |
 //! | supervisor | time-outs, latches faults, feeds the watchdog | watchdog resets, reset is dark |
 //! | link | requests | heartbeat runs out |
 //!
@@ -46,6 +47,7 @@ mod safety;
 mod shared;
 mod store;
 mod tasks;
+mod trigger_in;
 
 use defmt_rtt as _;
 use embassy_executor::Spawner;
@@ -59,8 +61,9 @@ bind_interrupts!(struct Irqs {
     TIMER1 => sequence::InterruptHandler, time_driver::InterruptHandler;
     TIMER0_BRK_UP_TRG_COM => guard::InterruptHandler, safety::GuardHandler;
     EXTI0_1 => safety::InterlockHandler;
-    // No such peripheral is used: the vector is a software interrupt.
+    // No such peripheral is used: the vectors are software interrupts.
     I2C0_EV => safety::WakeHandler;
+    I2C0_ER => trigger_in::EdgeHandler;
     ADC_CMP => adc::InterruptHandler;
     DMA_CHANNEL1_2 => dma::InterruptHandler;
     #[cfg(feature = "board-f330")]
@@ -102,22 +105,38 @@ async fn main(spawner: Spawner) {
         guard::Guard::new(p.TIMER0, p.DMA_CH4, output_pins[0], board::OFF_WORD, Priority::P1, Irqs);
     let interlock = gpio::Input::new(p.PA0, gpio::Pull::Down);
     let line = exti::RawLine::new(&interlock, exti::Edge::Both);
+    let trigger_in = gpio::Input::new(p.PA1, gpio::Pull::Down);
+    let trigger_line = exti::RawLine::new(&trigger_in, exti::Edge::Rising);
+    exti::RawLine::mask(board::TRIGGER_LINE);
     interrupt::I2C0_EV.set_priority(Priority::P2);
+    interrupt::I2C0_ER.set_priority(Priority::P1);
     interrupt::ADC_CMP.set_priority(Priority::P2);
     interrupt::EXTI0_1.set_priority(Priority::P0);
     // SAFETY: both handlers are bound above; that of priority 0 enters no critical section.
     unsafe {
         interrupt::I2C0_EV.enable();
+        interrupt::I2C0_ER.enable();
         interrupt::EXTI0_1.enable();
     }
     // The drivers live as long as the program: dropping one would let its pins float.
-    core::mem::forget((outputs, guard, interlock, line));
-    engine::install(sequence);
+    core::mem::forget((outputs, guard, interlock, line, trigger_in));
+    engine::install(sequence, trigger_line);
 
-    let mut controller =
-        Controller::new(board::identity(), engine::Engine, store::Store::new(p.FMC), boot);
-    controller.on_interlock(0, safety::interlock_is_closed());
-    shared::install(controller);
+    let store = store::Store::new(p.FMC);
+    shared::install(|| Controller::new(board::identity(), engine::Engine, store, boot));
+    let has_usb = embassy_gd32f3x0::rcu::has_usbfs();
+    shared::with_controller(|controller, _| {
+        controller.on_interlock(0, safety::interlock_is_closed());
+        if has_usb != board::HAS_USB {
+            controller.on_wrong_board(i32::from(has_usb), i32::from(board::HAS_USB));
+        }
+    });
+    if has_usb != board::HAS_USB {
+        defmt::error!(
+            "this firmware is for the {=str}, this chip is the other one: no light; flash the image of this board",
+            embassy_gd32f3x0::chip::NAME
+        );
+    }
     watchdog.feed();
 
     spawner.spawn(tasks::supervisor::run(watchdog).expect("spawned once"));
@@ -126,7 +145,9 @@ async fn main(spawner: Spawner) {
     spawner.spawn(tasks::temperature::run(adc, ntc).expect("spawned once"));
     let led = gpio::Output::new(p.PC13, gpio::Level::Low, gpio::Speed::Low);
     spawner.spawn(tasks::led::run(led).expect("spawned once"));
-    // Trigger-in: wired, held defined, not used by protocol 1.0; see docs/hardware.md.
-    core::mem::forget(gpio::Input::new(p.PA1, gpio::Pull::Down));
-    board::spawn_link!(spawner, p);
+    // A link that the chip does not have would be a bus fault; that the other one has is served, and
+    // tells the host what is wrong.
+    if has_usb || !board::HAS_USB {
+        board::spawn_link!(spawner, p);
+    }
 }

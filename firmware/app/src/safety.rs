@@ -4,7 +4,7 @@
 //! It is called by the interlock's interrupt (priority 0), the guard's, and the panic and fault
 //! handlers; it takes no lock. The first cut's time is kept for the account of the on-time.
 
-use crate::{board, shared};
+use crate::{board, shared, trigger_in};
 use core::cell::UnsafeCell;
 use core::panic::PanicInfo;
 use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -64,13 +64,20 @@ pub(crate) struct InterlockHandler;
 
 impl Handler<typelevel::EXTI0_1> for InterlockHandler {
     unsafe fn on_interrupt() {
-        // An opening that is over before this reads the level is an opening too: the falling edge
-        // brought us here, or a rising one that follows a falling one. Only a rising edge from
-        // rest finds the outputs low anyway.
-        cut();
-        exti::RawLine::acknowledge(0);
-        INTERLOCK_OPENED.store(true, Ordering::Release);
-        Interrupt::I2C0_EV.pend();
+        // Whatever brought us here but an edge at trigger-in, the other line of this vector, ends
+        // the light. An opening that is over before this runs is an opening too: the falling edge
+        // is pending, or a rising one that follows a falling one. Only a rising edge from rest
+        // finds the outputs low anyway.
+        let trigger = exti::RawLine::is_pending(board::TRIGGER_LINE);
+        if exti::RawLine::is_pending(0) || !trigger {
+            cut();
+            exti::RawLine::acknowledge(0);
+            INTERLOCK_OPENED.store(true, Ordering::Release);
+            Interrupt::I2C0_EV.pend();
+        }
+        if trigger {
+            trigger_in::on_edge();
+        }
     }
 }
 
@@ -111,6 +118,14 @@ unsafe fn HardFault(frame: &ExceptionFrame) -> ! {
     cut();
     remember(FaultReason::HardFault);
     defmt::error!("hard fault at {=u32:#x}", frame.pc());
+    reset::software_reset()
+}
+
+/// The clock monitor: the crystal has stopped, and the core runs from the internal oscillator.
+#[exception]
+unsafe fn NonMaskableInt() -> ! {
+    cut();
+    remember(FaultReason::Clock);
     reset::software_reset()
 }
 
@@ -207,8 +222,11 @@ pub(crate) fn boot(cause: reset::Cause) -> Boot {
         reset::Cause::Power => FaultSet::EMPTY,
         _ => FaultSet(recall().0),
     };
+    // A halt of a debugger that was not followed by the watchdog's reset is the debugger's affair:
+    // that is how an image is flashed.
+    let halted = reset::take_debug_halt();
     if cause == reset::Cause::Watchdog {
-        carried.insert(FaultReason::Watchdog);
+        carried.insert(if halted { FaultReason::DebugHalt } else { FaultReason::Watchdog });
     }
     keep(carried.0, 0);
     let cause = match cause {

@@ -28,10 +28,10 @@ pub(crate) static EVENT: Signal<ThreadModeRawMutex, ()> = Signal::new();
 static CONTROLLER: Mutex<ThreadModeRawMutex, RefCell<Option<&'static mut Controller>>> =
     Mutex::const_new(ThreadModeRawMutex::new(), RefCell::new(None));
 
-/// Puts the controller in its place.
-pub(crate) fn install(controller: Controller) {
+/// Puts the controller in its place; it is made there, not on the stack.
+pub(crate) fn install(make: impl FnOnce() -> Controller) {
     static PLACE: StaticCell<Controller> = StaticCell::new();
-    let controller = PLACE.init(controller);
+    let controller = PLACE.init_with(make);
     CONTROLLER.lock(|cell| cell.replace(Some(controller)));
 }
 
@@ -99,6 +99,7 @@ pub(crate) async fn serve(mut bytes: &[u8], sink: &mut impl ReplySink) {
 }
 
 /// Waits for the next event and writes it as a frame.
+#[cfg(feature = "board-f350")]
 pub(crate) async fn next_event(out: &mut [u8; MAX_FRAME_LEN]) -> usize {
     loop {
         if let Some(length) = take_event(out) {

@@ -38,13 +38,21 @@ fn arm(input: &Input<'_>, edge: Edge) -> u8 {
         }
         let exti = regs::exti();
         let bit = 1u32 << line;
-        let with = |on: bool| move |bits: u32| if on { bits | bit } else { bits & !bit };
-        exti.rten.update(with(edge != Edge::Falling));
-        exti.ften.update(with(edge != Edge::Rising));
+        select(bit, edge);
         exti.pd.set(bit); // cleared by writing one
         exti.inten.update(|bits| bits | bit);
     });
     line
+}
+
+/// Sets which edges of a line count (EXTI_RTEN, EXTI_FTEN).
+fn select(bit: u32, edge: Edge) {
+    let with = |on: bool| move |bits: u32| if on { bits | bit } else { bits & !bit };
+    critical_section::with(|_| {
+        let exti = regs::exti();
+        exti.rten.update(with(edge != Edge::Falling));
+        exti.ften.update(with(edge != Edge::Rising));
+    });
 }
 
 /// An input whose edges can be awaited.
@@ -154,6 +162,35 @@ impl RawLine {
     #[inline(always)]
     pub fn acknowledge(line: u8) {
         regs::exti().pd.set(1 << line);
+    }
+
+    /// Whether the edge has come at line `line` since the last [`RawLine::acknowledge`].
+    #[inline(always)]
+    pub fn is_pending(line: u8) -> bool {
+        regs::exti().pd.get() & 1 << line != 0
+    }
+
+    /// Stops the interrupts of line `line`. Also for its own handler, at whatever priority, as long
+    /// as everyone else changes enable bits only while the line is masked.
+    #[inline(always)]
+    pub fn mask(line: u8) {
+        regs::exti().inten.update(|bits| bits & !(1 << line));
+    }
+
+    /// Lets interrupts happen again; an edge in between is forgotten.
+    pub fn unmask(line: u8) {
+        critical_section::with(|_| {
+            let exti = regs::exti();
+            if exti.inten.get() & 1 << line == 0 {
+                exti.pd.set(1 << line);
+                exti.inten.update(|bits| bits | 1 << line);
+            }
+        });
+    }
+
+    /// Changes which edges count.
+    pub fn select(&self, edge: Edge) {
+        select(self.bit, edge);
     }
 
     /// Makes the interrupt happen as if the edge had come (EXTI_SWIEV).

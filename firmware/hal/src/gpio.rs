@@ -116,7 +116,9 @@ fn field2(register: u32, pin: u8, value: u8) -> u32 {
     register & !(0b11 << (2 * pin)) | u32::from(value) << (2 * pin)
 }
 
-/// Writes a pin's mode: 0 input, 1 output, 2 alternate function, 3 analog.
+/// Writes a pin's mode: 0 input, 1 output, 2 alternate function, 3 analog. Not inlined: a board has
+/// two dozen pins.
+#[inline(never)]
 fn set_mode(port: u8, pin: u8, mode: u8, pull: Pull, speed: Speed, open_drain: bool) {
     critical_section::with(|_| {
         let block = regs::gpio(port);
@@ -129,7 +131,11 @@ fn set_mode(port: u8, pin: u8, mode: u8, pull: Pull, speed: Speed, open_drain: b
 
 /// Gives a pin to a peripheral: alternate function `function` (data sheet, "Alternate functions").
 pub(crate) fn set_alternate(pin: &impl Pin, function: u8, pull: Pull, speed: Speed) {
-    let (port, number) = (pin.port(), pin.number());
+    alternate(pin.port(), pin.number(), function, pull, speed);
+}
+
+#[inline(never)]
+fn alternate(port: u8, number: u8, function: u8, pull: Pull, speed: Speed) {
     critical_section::with(|_| {
         let block = regs::gpio(port);
         let shift = 4 * u32::from(number % 8);

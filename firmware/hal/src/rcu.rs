@@ -78,6 +78,17 @@ pub struct Clocks {
     pub crystal_failed: bool,
 }
 
+/// Whether the chip has the USB core: whether the bit of its clock gate can be set. The F330's manual
+/// has the bit as reserved (that it reads as 0 there is inferred, not proven on hardware).
+pub fn has_usbfs() -> bool {
+    let ahben = &regs::rcu().ahben;
+    let before = ahben.get();
+    ahben.set(before | 1 << 12); // USBFSEN
+    let has = ahben.get() & 1 << 12 != 0;
+    ahben.set(before);
+    has
+}
+
 static AHB_HZ: AtomicU32 = AtomicU32::new(8_000_000);
 static APB_DIVISOR: AtomicU32 = AtomicU32::new(1);
 static CRYSTAL_FAILED: AtomicBool = AtomicBool::new(false);
@@ -166,6 +177,12 @@ pub(crate) fn init(config: &Config) {
     while rcu.ctl0.get() & 1 << 25 == 0 {} // PLLSTB
     rcu.cfg0.update(|bits| bits & !SCS_MASK | SCS_PLL);
     while rcu.cfg0.get() >> SCSS_SHIFT & SCS_MASK != SCS_PLL {}
+    if crystal.is_some() {
+        // A crystal that stops later: hardware goes back to IRC8M and raises an NMI (manual, "HXTAL
+        // clock monitor (CKM)"). Without it the core, the timers and the guard would stop with the
+        // outputs as they are, until the watchdog.
+        rcu.ctl0.modify(|_, w| w.ckmen().set_bit());
+    }
 
     AHB_HZ.store(pll.output_hz(), Ordering::Relaxed);
     APB_DIVISOR.store(apb_divisor, Ordering::Relaxed);

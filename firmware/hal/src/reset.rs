@@ -36,6 +36,21 @@ pub fn take_cause() -> Cause {
     }
 }
 
+/// Whether a debugger has halted the core since the last call or power-on, also before a reset: the
+/// debug fault status register (DFSR: HALTED, BKPT, DWTTRAP, VCATCH, EXTERNAL) is cleared by power-on
+/// and by writing ones (ARMv7-M Architecture Reference Manual, C1.6.1).
+pub fn take_debug_halt() -> bool {
+    const DFSR: *mut u32 = 0xe000_ed30 as *mut u32;
+    // SAFETY: a register of the core's system control space that nothing else uses.
+    unsafe {
+        let events = DFSR.read_volatile();
+        if events != 0 {
+            DFSR.write_volatile(events);
+        }
+        events != 0
+    }
+}
+
 /// The chip's unique 96-bit identifier (user manual, "Device electronic signature": 0x1FFF F7AC).
 pub fn unique_id() -> [u8; 12] {
     let mut id = [0; 12];

@@ -145,7 +145,8 @@ impl<'d> Sequence<'d> {
 
     /// Whether [`Sequence::start`] was called, and nothing has halted the chain since.
     pub fn is_running(&self) -> bool {
-        self.running && regs::dma_channel(PORT_CHANNEL).ctl.get() & Control::ENABLE != 0
+        let on = |channel| regs::dma_channel(channel).ctl.get() & Control::ENABLE != 0;
+        self.running && on(PORT_CHANNEL) && on(TIME_CHANNEL)
     }
 
     /// Appends edges, all of them or none.

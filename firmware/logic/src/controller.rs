@@ -30,6 +30,7 @@ use stspp_protocol::fault::{FaultReason, FaultRecord, FaultSet};
 use stspp_protocol::message::{Event, Reply, Request, Serve, encode_error};
 use stspp_protocol::reply::{DeviceState, LinkCounters, RequestError};
 use stspp_protocol::timing::Limits;
+use stspp_protocol::trigger::TriggerSource;
 use stspp_protocol::version::{
     BoardKind, Capabilities, DeviceInfo, FirmwareVersion, PROTOCOL_VERSION, ResetCause,
     SerialNumber,
@@ -81,7 +82,8 @@ impl Identity {
         let both = Capabilities::SETTINGS_STORE
             .union(Capabilities::BOOTLOADER)
             .union(Capabilities::FLOODLIGHT)
-            .union(Capabilities::TEMPERATURE);
+            .union(Capabilities::TEMPERATURE)
+            .union(Capabilities::TRIGGER_IN);
         let capabilities = match board {
             BoardKind::F330 => both,
             BoardKind::F350 => both.union(Capabilities::USB_SOF),
@@ -135,6 +137,9 @@ pub struct Controller<E, S> {
     decoder: FrameDecoder,
     bytes_overrun: u32,
     pub(crate) action: Option<SystemAction>,
+    pub(crate) trigger_source: TriggerSource,
+    /// Minor of the host's protocol, from its `Hello`; 0 before one.
+    pub(crate) host_minor: u16,
 }
 
 impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
@@ -183,6 +188,8 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
             decoder: FrameDecoder::new(),
             bytes_overrun: 0,
             action: None,
+            trigger_source: TriggerSource::FreeRunning,
+            host_minor: 0,
         }
     }
 
@@ -231,7 +238,7 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
             let silence_us = i32::try_from(silence_us).unwrap_or(i32::MAX);
             self.fault(FaultReason::HeartbeatLost, silence_us, as_value(timeout_us));
         }
-        if self.sequencer.deadline_us().is_some_and(|deadline_us| now_us >= deadline_us) {
+        if self.slot_deadline_us().is_some_and(|deadline_us| now_us >= deadline_us) {
             let done = self.sequencer.slots_done();
             self.fault(FaultReason::Engine, as_value(done), as_value(done.saturating_add(1)));
         }
@@ -259,7 +266,11 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
         let floodlight = self
             .floodlight
             .map(|floodlight| floodlight.until_us.saturating_add(FLOODLIGHT_MARGIN_US));
-        [heartbeat, floodlight, self.sequencer.deadline_us()].into_iter().flatten().min()
+        [heartbeat, floodlight, self.slot_deadline_us()].into_iter().flatten().min()
+    }
+
+    fn slot_deadline_us(&self) -> Option<u64> {
+        self.sequencer.deadline_us(self.engine.trigger_edges().slot_under_way_us)
     }
 
     /// Takes the engine's report of a slot whose gate has gone off.
@@ -335,6 +346,20 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
     pub fn on_fault(&mut self, now_us: u64, reason: FaultReason, value: i32, limit: i32) {
         self.now_us = self.now_us.max(now_us);
         self.fault(reason, value, limit);
+    }
+
+    /// The board found that a debugger has halted the processor: the outputs' supervision stood still.
+    pub fn on_debug_halt(&mut self, now_us: u64) {
+        self.now_us = self.now_us.max(now_us);
+        if self.light_allowed() {
+            self.fault(FaultReason::DebugHalt, 0, 0);
+        }
+    }
+
+    /// The board is not the one that this firmware is for: no light for as long as it runs.
+    pub fn on_wrong_board(&mut self, found: i32, needed: i32) {
+        self.interlock.set_active(FaultReason::WrongBoard, true);
+        self.fault(FaultReason::WrongBoard, found, needed);
     }
 
     // ---- Outputs ------------------------------------------------------------------------------
@@ -435,7 +460,7 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
     /// Forces every output off and settles what was lit. Returns an emitter that has overdrawn.
     fn force_off(&mut self) -> Result<(), Exhausted> {
         let aborted = self.engine.force_off();
-        let was_running = self.sequencer.deadline_us().is_some();
+        let was_running = self.sequencer.is_running();
         self.sequencer.aborted(aborted.slots_triggered);
         self.charge_floodlight();
         self.floodlight = None;
@@ -461,7 +486,8 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
         // The outputs are off already; a bucket that this overdraws adds nothing to that.
         let _ = self.force_off();
         let record = FaultRecord { reason, time_us: self.now_us, value, limit };
-        if let Some(record) = self.interlock.latch(record) {
+        if let Some(mut record) = self.interlock.latch(record) {
+            record.reason = record.reason.as_of(self.host_minor);
             self.outbox.push(FaultEvent { record, latched: self.interlock.latched() });
         }
         self.enter(DeviceState::Faulted);

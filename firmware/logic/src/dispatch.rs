@@ -11,10 +11,12 @@ use stspp_protocol::reply::{
 };
 use stspp_protocol::request::{
     Arm, BOOTLOADER_KEY, ClearFaults, Disarm, FloodlightOff, FloodlightOn, GetFaults, GetInfo,
-    GetStatus, GetTiming, Heartbeat, Hello, LoadDefaults, LoadSettings, RebootToBootloader, Reset,
-    SaveSettings, SetTiming, StartBurst, StartStream, StopStream,
+    GetStatus, GetTiming, GetTriggerSource, Heartbeat, Hello, LoadDefaults, LoadSettings,
+    RebootToBootloader, Reset, SaveSettings, SetTiming, SetTriggerSource, StartBurst, StartStream,
+    StopStream,
 };
 use stspp_protocol::timing::ProjectionTiming;
+use stspp_protocol::trigger::{TriggerInput, TriggerSource};
 use stspp_protocol::version::{Capabilities, DeviceInfo, PROTOCOL_VERSION};
 
 use crate::controller::{Controller, Floodlight, Session};
@@ -26,6 +28,9 @@ use crate::timing::{GateWord, SlotPlan};
 impl<E: GateEngine, S: SettingsStore> Serve for Controller<E, S> {
     fn hello(&mut self, request: Hello) -> Result<DeviceInfo, RequestError> {
         self.go_dark();
+        // A host that knows nothing of trigger-in must not wait for its edges.
+        self.choose_trigger(TriggerSource::FreeRunning);
+        self.host_minor = request.host.minor;
         if request.host.is_compatible_with(PROTOCOL_VERSION) {
             self.session = Session::Open;
             Ok(self.info())
@@ -148,7 +153,7 @@ impl<E: GateEngine, S: SettingsStore> Serve for Controller<E, S> {
     }
 
     fn get_faults(&mut self, _: GetFaults) -> Result<FaultReport, RequestError> {
-        Ok(self.interlock.report())
+        Ok(self.interlock.report(self.host_minor))
     }
 
     fn clear_faults(&mut self, _: ClearFaults) -> Result<FaultReport, RequestError> {
@@ -156,7 +161,7 @@ impl<E: GateEngine, S: SettingsStore> Serve for Controller<E, S> {
         if self.interlock.clear() && self.state == DeviceState::Faulted {
             self.enter(DeviceState::Idle);
         }
-        Ok(self.interlock.report())
+        Ok(self.interlock.report(self.host_minor))
     }
 
     fn save_settings(&mut self, _: SaveSettings) -> Result<Done, RequestError> {
@@ -206,6 +211,29 @@ impl<E: GateEngine, S: SettingsStore> Serve for Controller<E, S> {
         self.action = Some(SystemAction::Bootloader);
         Ok(Done)
     }
+
+    fn set_trigger_source(&mut self, request: SetTriggerSource) -> Result<Done, RequestError> {
+        self.check_session()?;
+        if !self.identity.capabilities.contains(Capabilities::TRIGGER_IN) {
+            return Err(RequestError::Unsupported);
+        }
+        if self.state == DeviceState::Running {
+            let (state, needed) = (self.state, DeviceState::Armed);
+            return Err(RequestError::WrongState { state, needed });
+        }
+        request.source.validate()?;
+        self.choose_trigger(request.source);
+        Ok(Done)
+    }
+
+    fn get_trigger_source(&mut self, _: GetTriggerSource) -> Result<TriggerInput, RequestError> {
+        let edges = self.engine.trigger_edges();
+        Ok(TriggerInput {
+            source: self.trigger_source,
+            edges_taken: edges.taken,
+            edges_ignored: edges.ignored,
+        })
+    }
 }
 
 impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
@@ -226,6 +254,12 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
         } else {
             Err(RequestError::WrongState { state: self.state, needed })
         }
+    }
+
+    /// Called only when no run is under way.
+    fn choose_trigger(&mut self, source: TriggerSource) {
+        self.trigger_source = source;
+        self.engine.set_trigger_source(source);
     }
 
     /// Flash work stalls the processor, and settings change under a run only by `SetTiming`.
@@ -266,7 +300,8 @@ impl<E: GateEngine, S: SettingsStore> Controller<E, S> {
         self.end_floodlight();
         let first_frame_sequence = self.sequencer.next_frame_sequence();
         let start_time_us = self.engine.start(slots);
-        self.sequencer.started(start_time_us, slots);
+        let external = self.trigger_source != TriggerSource::FreeRunning;
+        self.sequencer.started(start_time_us, slots, external);
         self.enter(DeviceState::Running);
         let timing_generation = self.sequencer.generation();
         Ok(Started { first_frame_sequence, timing_generation, start_time_us })

@@ -4,6 +4,8 @@
 //! four compare matches move words from tables to the ports (DMA), plus one interrupt per slot that
 //! reports what was done. The simulator computes the same edges from the same plan.
 
+use stspp_protocol::trigger::TriggerSource;
+
 use crate::timing::{GateWord, SlotPlan};
 
 /// Drives gates and camera triggers on its own once started.
@@ -40,6 +42,28 @@ pub trait GateEngine {
 
     /// Level of the floodlight's output outside of a run.
     fn floodlight_is_on(&self) -> bool;
+
+    /// Chooses what starts the slots of the runs to come. Called only when stopped.
+    ///
+    /// With an external source, [`start`](Self::start) returns the time from which edges count, and an
+    /// edge at `e` starts the next slot at `e + delay_us`; one whose slot would begin less than the
+    /// plan's period after the slot before is ignored and counted.
+    fn set_trigger_source(&mut self, source: TriggerSource);
+
+    /// Edges at trigger-in during runs since reset: those that started a slot, those ignored.
+    fn trigger_edges(&self) -> TriggerEdges;
+}
+
+/// Edges seen at trigger-in; the counts wrap.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct TriggerEdges {
+    /// Started a slot.
+    pub taken: u32,
+    /// Came too soon.
+    pub ignored: u32,
+    /// Start of the slot that the last of them began, where that is not reported yet: device time.
+    pub slot_under_way_us: Option<u64>,
 }
 
 /// What the engine did in one slot: its own account, not a look-up in what was asked.

@@ -112,14 +112,16 @@ impl Interlock {
         self.temperature_dc
     }
 
-    /// What the host gets.
+    /// What a host of protocol 1.`minor` gets.
     #[must_use]
-    pub const fn report(&self) -> FaultReport {
+    pub fn report(&self, minor: u16) -> FaultReport {
+        let known =
+            |record: FaultRecord| FaultRecord { reason: record.reason.as_of(minor), ..record };
         FaultReport {
             latched: self.latched,
             active: self.active,
-            first: self.first,
-            last: self.last,
+            first: self.first.map(known),
+            last: self.last.map(known),
         }
     }
 }

@@ -12,12 +12,17 @@
 //!   stop, load     └► retract n + 1 if it has not begun and can still be held
 //! ```
 //!
+//! In a run with an external trigger a slot is committed when its edge is seen
+//! ([`Runner::on_trigger_edge`]), and nothing else commits one.
+//!
 //! The owner calls [`Runner::on_events`] from the interrupt that follows each edge. How late that
 //! runs does not move any edge; it must only run once per slot.
 
 use heapless::{Deque, Vec};
 
-use crate::hardware::{Aborted, SlotDone};
+use stspp_protocol::trigger::TriggerSource;
+
+use crate::hardware::{Aborted, SlotDone, TriggerEdges};
 use crate::timing::{GateWord, SlotPlan};
 
 /// From a start request to slot 0.
@@ -90,8 +95,11 @@ struct Slot {
 struct Run {
     next_number: u32,
     next_index: usize,
+    /// Free-running: start of the next slot. External: the soonest that it may start.
     next_start_us: u64,
     end: Option<u32>,
+    /// From an edge at trigger-in to the start of its slot; `None` for a free run.
+    external_delay_us: Option<u32>,
 }
 
 /// What the events since the last call mean to a guard of the on-time.
@@ -113,6 +121,8 @@ pub struct Runner {
     processed: u32,
     is_lit: bool,
     triggered: u32,
+    source: TriggerSource,
+    edges: TriggerEdges,
 }
 
 impl Runner {
@@ -127,13 +137,56 @@ impl Runner {
             processed: 0,
             is_lit: false,
             triggered: 0,
+            source: TriggerSource::FreeRunning,
+            edges: TriggerEdges { taken: 0, ignored: 0, slot_under_way_us: None },
         }
     }
 
     /// Whether a slot is committed or may still be.
     #[must_use]
     pub fn is_running(&self) -> bool {
-        !self.committed.is_empty()
+        !self.committed.is_empty() || self.waits_for_edge()
+    }
+
+    /// Whether an edge at trigger-in would start a slot now or later.
+    #[must_use]
+    pub fn waits_for_edge(&self) -> bool {
+        self.run.is_some_and(|run| {
+            run.external_delay_us.is_some() && run.end.is_none_or(|end| run.next_number < end)
+        })
+    }
+
+    /// Chooses what starts the slots of the next run.
+    pub const fn set_trigger_source(&mut self, source: TriggerSource) {
+        self.source = source;
+    }
+
+    /// Edges so far, and the slot that waits or plays by one.
+    #[must_use]
+    pub fn trigger_edges(&self) -> TriggerEdges {
+        let external = self.run.is_some_and(|run| run.external_delay_us.is_some());
+        let slot = self.committed.front().filter(|_| external);
+        TriggerEdges { slot_under_way_us: slot.map(|slot| slot.start_us), ..self.edges }
+    }
+
+    /// Notes an edge at trigger-in at `at_us`, and `more` that came too close to it to be told apart.
+    /// Commits its slot, or counts it where that would begin too soon.
+    pub fn on_trigger_edge(&mut self, at_us: u64, more: u32, queue: &mut impl EdgeQueue) {
+        if !self.waits_for_edge() {
+            return;
+        }
+        let Some(run) = &mut self.run else { return };
+        let start_us = at_us.saturating_add(u64::from(run.external_delay_us.unwrap_or(0)));
+        let number = run.next_number;
+        if start_us >= run.next_start_us && !self.committed.is_full() {
+            run.next_start_us = start_us;
+            self.commit(queue);
+        }
+        // Too soon, or too late for the queue.
+        let taken = self.run.is_some_and(|run| run.next_number != number);
+        self.edges.taken = self.edges.taken.wrapping_add(u32::from(taken));
+        let ignored = more.wrapping_add(u32::from(!taken));
+        self.edges.ignored = self.edges.ignored.wrapping_add(ignored);
     }
 
     /// Takes a plan: for the next start or, running, for the next cycle boundary that can be met.
@@ -161,9 +214,22 @@ impl Runner {
         self.processed = 0;
         self.triggered = 0;
         self.is_lit = false;
-        let start_us = queue.now_us().saturating_add(START_LEAD_US);
-        self.run = Some(Run { next_number: 0, next_index: 0, next_start_us: start_us, end: slots });
-        self.commit(queue);
+        let external_delay_us = match self.source {
+            TriggerSource::FreeRunning => None,
+            TriggerSource::External(external) => Some(external.delay_us),
+        };
+        let lead_us = if external_delay_us.is_some() { 0 } else { START_LEAD_US };
+        let start_us = queue.now_us().saturating_add(lead_us);
+        self.run = Some(Run {
+            next_number: 0,
+            next_index: 0,
+            next_start_us: start_us,
+            end: slots,
+            external_delay_us,
+        });
+        if external_delay_us.is_none() {
+            self.commit(queue);
+        }
         start_us
     }
 
@@ -173,7 +239,12 @@ impl Runner {
         self.retract_next(queue);
         let Some(run) = &mut self.run else { return self.triggered };
         run.end = Some(run.next_number);
-        run.next_number
+        let slots = run.next_number;
+        if self.committed.is_empty() {
+            // Between two edges at trigger-in there is nothing to wait for.
+            self.run = None;
+        }
+        slots
     }
 
     /// Notes that all outputs are off and the queue is dead, at `now_us` and after `happened`
@@ -206,6 +277,9 @@ impl Runner {
     ) -> Light {
         let was_lit = self.is_lit;
         let was_dark = self.advance(happened, usb_sof, report) || !was_lit;
+        if self.run.is_some_and(|run| run.external_delay_us.is_some()) {
+            return Light { was_dark, is_lit: self.is_lit };
+        }
         let first_has_begun = self.committed.front().is_some_and(|slot| {
             self.committed.len() == 1 && self.processed.wrapping_sub(slot.first_event) as i32 > 0
         });

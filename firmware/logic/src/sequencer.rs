@@ -46,6 +46,8 @@ struct Run {
     /// Longest period of the timings that this run may be under.
     slowest_period_us: u32,
     deadline_us: u64,
+    /// Slots start by edges at trigger-in: between them nothing is due.
+    external: bool,
 }
 
 /// The accepted timing and the run under way.
@@ -127,7 +129,7 @@ impl Sequencer {
     }
 
     /// Notes that the engine was started.
-    pub fn started(&mut self, start_time_us: u64, slots: Option<u32>) {
+    pub fn started(&mut self, start_time_us: u64, slots: Option<u32>, external: bool) {
         self.first_frame_sequence = self.next_frame_sequence;
         self.lit_generation = self.generation;
         let period_us = self.timing.frame_period_us;
@@ -138,6 +140,7 @@ impl Sequencer {
             deadline_us: start_time_us
                 .saturating_add(u64::from(period_us))
                 .saturating_add(SUPERVISION_MARGIN_US),
+            external,
         });
     }
 
@@ -215,13 +218,22 @@ impl Sequencer {
         Ok(Progress { timing, trigger, run_ended })
     }
 
-    /// Device time at which the slot under way is overdue.
+    /// Whether a run is under way.
     #[must_use]
-    pub const fn deadline_us(&self) -> Option<u64> {
-        match &self.run {
-            Some(run) => Some(run.deadline_us),
-            None => None,
+    pub const fn is_running(&self) -> bool {
+        self.run.is_some()
+    }
+
+    /// Device time at which the slot under way is overdue. `external_start_us` is the start of the
+    /// slot that an edge at trigger-in began and that is not reported yet.
+    #[must_use]
+    pub fn deadline_us(&self, external_start_us: Option<u64>) -> Option<u64> {
+        let run = self.run.as_ref()?;
+        if !run.external {
+            return Some(run.deadline_us);
         }
+        let late_us = u64::from(run.slowest_period_us).saturating_add(SUPERVISION_MARGIN_US);
+        external_start_us.map(|start_us| start_us.saturating_add(late_us))
     }
 
     /// Slots of the run that are done.

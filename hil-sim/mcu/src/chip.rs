@@ -277,11 +277,14 @@ impl Chip {
     /// Applies interrupt lines, resets, clock changes and flash waits.
     fn attend(&mut self) {
         self.shared.attention.store(false, Ordering::Relaxed);
-        let (levels, reset, clocks) = {
+        let (levels, reset, nmi, clocks) = {
             let mut soc = self.soc();
-            (soc.irq_levels(), soc.take_reset(), soc.clocks)
+            (soc.irq_levels(), soc.take_reset(), soc.take_nmi(), soc.clocks)
         };
         self.clocks = clocks;
+        if nmi {
+            self.cpu.raise_nmi();
+        }
         if let Some(cause) = reset {
             self.reset(cause);
             return;
@@ -321,6 +324,9 @@ impl Chip {
         let time_ns = self.now_ns();
         self.resets.push(ResetEvent { time_ns, cause });
         self.cpu.reset();
+        if cause == ResetCause::Power {
+            self.cpu.set_debug_events(0);
+        }
         self.applied_irqs = 0;
         self.lockup_seen = false;
         self.stop = Stop::Running;
@@ -338,8 +344,19 @@ impl Chip {
     /// A debugger halts the core, or lets it go on.
     pub fn set_debug_halt(&mut self, halted: bool) {
         self.stop = if halted { Stop::Halted } else { Stop::Running };
+        if halted {
+            // DFSR.HALTED.
+            self.cpu.set_debug_events(1);
+        }
         let now = self.now;
         self.soc().set_halted(halted, now);
+        self.attend();
+    }
+
+    /// The board's crystal stops, or works (again).
+    pub fn set_crystal(&mut self, works: bool) {
+        let now = self.now;
+        self.soc().set_crystal(works, now);
         self.attend();
     }
 

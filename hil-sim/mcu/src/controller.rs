@@ -101,7 +101,15 @@ impl McuController {
     /// # Errors
     /// The firmware does not enumerate on USB.
     pub fn start(variant: Variant, image: Image) -> Result<Self, ControllerError> {
-        let chip = Chip::new(variant, &image);
+        Self::on_chip(Chip::new(variant, &image), image)
+    }
+
+    /// Takes a chip that was just powered with `image`; the link is up when this returns.
+    ///
+    /// # Errors
+    /// The firmware does not enumerate on USB.
+    pub fn on_chip(chip: Chip, image: Image) -> Result<Self, ControllerError> {
+        let variant = chip.soc().variant();
         let usb = (variant == Variant::F350).then(UsbLink::default);
         let mut controller = Self {
             chip,
@@ -116,6 +124,7 @@ impl McuController {
         };
         controller.set_interlock_closed(true);
         controller.set_temperature_c(25.0);
+        controller.set_trigger_in(false);
         if controller.usb.is_some() {
             controller.enumerate()?;
         } else {
@@ -367,6 +376,11 @@ impl Controller for McuController {
     fn set_temperature_c(&mut self, temperature_c: f32) {
         let channel = self.board.thermistor_channel;
         self.chip.soc().adc.set_volts(channel, thermistor_volts(temperature_c));
+    }
+
+    fn set_trigger_in(&mut self, high: bool) {
+        let pin = self.board.trigger_in;
+        self.chip.drive_pin(pin, Some(high));
     }
 
     fn set_link_connected(&mut self, connected: bool) {

@@ -116,6 +116,10 @@ impl Controller for SharedController {
         self.lock().set_temperature_c(temperature_c);
     }
 
+    fn set_trigger_in(&mut self, high: bool) {
+        self.lock().set_trigger_in(high);
+    }
+
     fn set_link_connected(&mut self, connected: bool) {
         self.lock().set_link_connected(connected);
     }

@@ -12,10 +12,12 @@ use stspp_protocol::message::{Event, MESSAGE_TABLE, Reply, Request};
 use stspp_protocol::reply::{DeviceState, RequestError};
 use stspp_protocol::request::{
     Arm, BOOTLOADER_KEY, ClearFaults, Disarm, FloodlightOff, FloodlightOn, GetFaults, GetInfo,
-    GetStatus, GetTiming, Heartbeat, Hello, LoadDefaults, LoadSettings, RebootToBootloader, Reset,
-    SaveSettings, SetTiming, StartBurst, StartStream, StopStream,
+    GetStatus, GetTiming, GetTriggerSource, Heartbeat, Hello, LoadDefaults, LoadSettings,
+    RebootToBootloader, Reset, SaveSettings, SetTiming, SetTriggerSource, StartBurst, StartStream,
+    StopStream,
 };
 use stspp_protocol::timing::{ProjectionTiming, Slot};
+use stspp_protocol::trigger::TriggerSource;
 use stspp_protocol::usb;
 use stspp_protocol::version::PROTOCOL_VERSION;
 use stspp_protocol::wire::MAX_FRAME_LEN;
@@ -36,6 +38,8 @@ fn all_requests() -> Vec<Request> {
         Request::GetTiming(GetTiming),
         Request::SaveSettings(SaveSettings),
         Request::LoadSettings(LoadSettings),
+        Request::SetTriggerSource(SetTriggerSource { source: TriggerSource::default() }),
+        Request::GetTriggerSource(GetTriggerSource),
         Request::Arm(Arm),
         Request::FloodlightOn(FloodlightOn { duration_us: 2_000 }),
         Request::FloodlightOff(FloodlightOff),

@@ -137,7 +137,9 @@ fn ten_thousand_slots_under_flood(variant: Variant) {
         })
         .collect();
     println!("{variant:?}: {} of {} trigger events arrived under flood", labels.len(), gates.len());
-    assert!(labels.windows(2).all(|pair| pair[1] > pair[0]), "events out of order");
+    assert!(labels.windows(2).all(|pair| pair[1] == pair[0] + 1), "events lost or out of order");
+    // The last slot may not be over, and the events of those before the first were taken.
+    assert!(labels.len() + 3 >= gates.len(), "{} of {} labels", labels.len(), gates.len());
     common::assert_all_modelled(&mut session);
 }
 

@@ -143,6 +143,7 @@ pub struct InProcess {
     suspend_at_ns: Option<u64>,
     interlock_closed: bool,
     temperature_dc: i16,
+    trigger_in: bool,
     link_faults: LinkFaults,
     /// Edges of a life that has ended.
     edges: Vec<PinEdge>,
@@ -170,6 +171,7 @@ impl InProcess {
             suspend_at_ns: None,
             interlock_closed: true,
             temperature_dc: 250,
+            trigger_in: false,
             link_faults: LinkFaults::default(),
             edges: Vec::new(),
         };
@@ -268,6 +270,7 @@ impl InProcess {
                 let has_usb = self.options.board == BoardKind::F350;
                 let mut engine = VirtualEngine::new(clock, has_usb);
                 engine.set_now_ns(self.now_ns);
+                engine.set_trigger_in(self.trigger_in);
                 let identity = Identity::new(self.options.board, self.options.serial);
                 let mut logic = Logic::new(identity, engine, flash, boot);
                 logic.on_interlock(0, self.interlock_closed);
@@ -462,6 +465,15 @@ impl Controller for InProcess {
         self.temperature_dc = (temperature_c * 10.0).round() as i16;
         let temperature_dc = self.temperature_dc;
         self.with_logic(|logic, now_us| logic.on_temperature(now_us, temperature_dc));
+    }
+
+    fn set_trigger_in(&mut self, high: bool) {
+        self.trigger_in = high;
+        let now_ns = self.now_ns;
+        if let Life::Up(logic) | Life::Hung(logic, _) = &mut self.life {
+            logic.engine_mut().set_now_ns(now_ns);
+            logic.engine_mut().set_trigger_in(high);
+        }
     }
 
     fn set_link_connected(&mut self, connected: bool) {

@@ -48,6 +48,9 @@ pub trait Controller: Send {
     /// Sets the temperature at the projector board's NTC. Starts at 25.
     fn set_temperature_c(&mut self, temperature_c: f32);
 
+    /// Sets the level at the trigger input. Starts low.
+    fn set_trigger_in(&mut self, high: bool);
+
     /// Cuts or restores the control link (cable pulled). Starts connected.
     fn set_link_connected(&mut self, connected: bool);
 }

@@ -7,6 +7,7 @@ use stspp_protocol::message::{Event, REPLY_BIT, Reply, Request};
 use stspp_protocol::reply::{DeviceState, RequestError, RequestField, StorageError};
 use stspp_protocol::request::*;
 use stspp_protocol::timing::{Limits, ProjectionTiming, Slot, TimingField};
+use stspp_protocol::trigger::TriggerSource;
 use stspp_protocol::version::{
     BoardKind, Capabilities, PROTOCOL_VERSION, ProtocolVersion, ResetCause,
 };
@@ -89,6 +90,8 @@ fn every_request_is_served() {
         Request::SaveSettings(SaveSettings),
         Request::LoadDefaults(LoadDefaults),
         Request::LoadSettings(LoadSettings),
+        Request::SetTriggerSource(SetTriggerSource { source: TriggerSource::default() }),
+        Request::GetTriggerSource(GetTriggerSource),
         Request::Arm(Arm),
         Request::FloodlightOn(FloodlightOn { duration_us: 1_000 }),
         Request::FloodlightOff(FloodlightOff),

@@ -10,6 +10,7 @@ use stspp_protocol::message::Request;
 use stspp_protocol::reply::{DeviceState, RequestError, StorageError};
 use stspp_protocol::request::*;
 use stspp_protocol::timing::ProjectionTiming;
+use stspp_protocol::trigger::{ExternalTrigger, TriggerEdge, TriggerSource};
 use stspp_protocol::version::{PROTOCOL_VERSION, ProtocolVersion};
 
 use crate::host::{Host, MS};
@@ -24,6 +25,14 @@ enum Step {
 
 fn timing(exposure_us: u32) -> ProjectionTiming {
     ProjectionTiming { frame_period_us: 2_000, exposure_us, ..ProjectionTiming::default() }
+}
+
+/// A slot cannot start as long after its edge as this.
+const TOO_LATE: TriggerSource =
+    TriggerSource::External(ExternalTrigger { edge: TriggerEdge::Rising, delay_us: 5_000 });
+
+fn set_trigger(source: TriggerSource) -> Request {
+    Request::SetTriggerSource(SetTriggerSource { source })
 }
 
 fn step() -> impl Strategy<Value = Step> {
@@ -52,6 +61,9 @@ fn step() -> impl Strategy<Value = Step> {
         2 => Just(Request::LoadSettings(LoadSettings)),
         1 => Just(Request::LoadDefaults(LoadDefaults)),
         1 => Just(Request::RebootToBootloader(RebootToBootloader { key: 1 })),
+        1 => Just(Request::GetTriggerSource(GetTriggerSource)),
+        1 => Just(set_trigger(TriggerSource::FreeRunning)),
+        1 => Just(set_trigger(TOO_LATE)),
     ];
     prop_oneof![
         20 => request.prop_map(Step::Ask),
@@ -126,6 +138,7 @@ impl Model {
             | Request::GetStatus(_)
             | Request::GetTiming(_)
             | Request::GetFaults(_)
+            | Request::GetTriggerSource(_)
             | Request::FloodlightOff(_) => Ok(()),
             Request::Disarm(_) => {
                 self.dark();
@@ -134,6 +147,13 @@ impl Model {
             Request::StopStream(_) => {
                 self.ends |= self.state == Running;
                 Ok(())
+            }
+            Request::SetTriggerSource(set) => {
+                open?;
+                if self.state == Running {
+                    return Err(RequestError::WrongState { state: Running, needed: Armed });
+                }
+                set.source.validate()
             }
             Request::SetTiming(set) => {
                 open?;

@@ -4,7 +4,7 @@
 
 use proptest::prelude::*;
 use stspp_firmware_logic::controller::{Boot, Controller as Logic, Identity};
-use stspp_firmware_logic::hardware::{Aborted, GateEngine, SlotDone};
+use stspp_firmware_logic::hardware::{Aborted, GateEngine, SlotDone, TriggerEdges};
 use stspp_firmware_logic::runner::{Edge, EdgeQueue, Refused, Runner};
 use stspp_firmware_logic::timing::{GateWord, SlotPlan};
 use stspp_hil_sim::device::in_process::flash::MemoryFlash;
@@ -14,6 +14,7 @@ use stspp_protocol::fault::FaultSet;
 use stspp_protocol::message::Request;
 use stspp_protocol::request::*;
 use stspp_protocol::timing::ProjectionTiming;
+use stspp_protocol::trigger::{ExternalTrigger, TriggerEdge, TriggerSource};
 use stspp_protocol::version::{BoardKind, PROTOCOL_VERSION, ResetCause};
 use stspp_protocol::wire::MAX_FRAME_LEN;
 
@@ -140,6 +141,14 @@ impl GateEngine for RunnerEngine {
     fn floodlight_is_on(&self) -> bool {
         self.gates.floodlight()
     }
+
+    fn set_trigger_source(&mut self, source: TriggerSource) {
+        self.runner.set_trigger_source(source);
+    }
+
+    fn trigger_edges(&self) -> TriggerEdges {
+        self.runner.trigger_edges()
+    }
 }
 
 struct Twin {
@@ -182,6 +191,13 @@ impl Twin {
         self.logic.engine_mut().queue.now_us = until_us;
     }
 
+    /// A rising edge at trigger-in.
+    fn edge(&mut self, now_us: u64) {
+        self.run_until(now_us);
+        let RunnerEngine { runner, queue, .. } = self.logic.engine_mut();
+        runner.on_trigger_edge(now_us, 0, queue);
+    }
+
     fn hear(&mut self, now_us: u64, mut bytes: &[u8]) {
         self.run_until(now_us);
         let mut out = [0; MAX_FRAME_LEN];
@@ -210,16 +226,40 @@ fn request() -> impl Strategy<Value = Request> {
     ]
 }
 
+/// What comes from outside.
+#[derive(Debug, Clone)]
+enum Input {
+    Request(Request),
+    /// A pulse at trigger-in.
+    Pulse,
+}
+
 /// Compares the two over a script of requests, each so many microseconds after the one before.
 fn compare(script: &[(u64, Request)]) -> Result<usize, TestCaseError> {
+    let script: Vec<_> = script
+        .iter()
+        .map(|(wait_us, request)| (*wait_us, Input::Request(request.clone())))
+        .collect();
+    compare_inputs(&script)
+}
+
+fn compare_inputs(script: &[(u64, Input)]) -> Result<usize, TestCaseError> {
     let options = InProcessOptions::default();
     let mut twin = Twin::new(&options);
     let mut device = InProcess::new(options);
     let (mut edges, mut said) = (Vec::new(), Vec::new());
     let mut now_us = 0;
     let mut out = [0; MAX_FRAME_LEN];
-    for (seq, (wait_us, request)) in script.iter().enumerate() {
+    for (seq, (wait_us, input)) in script.iter().enumerate() {
         now_us += wait_us;
+        let Input::Request(request) = input else {
+            device.run_until(now_us * 1_000, &mut edges);
+            device.host_read(&mut said);
+            device.set_trigger_in(true);
+            device.set_trigger_in(false);
+            twin.edge(now_us);
+            continue;
+        };
         let bytes = request.encode(seq as u16, &mut out).unwrap();
         device.run_until(now_us * 1_000 - LINK_LATENCY_NS, &mut edges);
         device.host_write(bytes);
@@ -259,6 +299,43 @@ proptest! {
         ];
         whole.extend(script);
         compare(&whole)?;
+    }
+}
+
+fn external(delay_us: u32) -> Request {
+    let external = ExternalTrigger { edge: TriggerEdge::Rising, delay_us };
+    Request::SetTriggerSource(SetTriggerSource { source: TriggerSource::External(external) })
+}
+
+fn input() -> impl Strategy<Value = Input> {
+    let source = prop_oneof![
+        2 => (60u32..900).prop_map(external),
+        1 => Just(Request::SetTriggerSource(SetTriggerSource { source: TriggerSource::FreeRunning })),
+        1 => Just(Request::GetTriggerSource(GetTriggerSource)),
+    ];
+    prop_oneof![
+        8 => Just(Input::Pulse),
+        3 => request().prop_map(Input::Request),
+        1 => source.prop_map(Input::Request),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(1_000))]
+
+    #[test]
+    fn both_engines_follow_trigger_in_alike(
+        delay_us in 60u32..900,
+        script in prop::collection::vec((prop_oneof![100u64..3_000, 100u64..30_000], input()), 1..80),
+    ) {
+        let mut whole = vec![
+            (100, Input::Request(Request::Hello(Hello { host: PROTOCOL_VERSION }))),
+            (100, Input::Request(external(delay_us))),
+            (100, Input::Request(Request::Arm(Arm))),
+            (100, Input::Request(Request::StartStream(StartStream))),
+        ];
+        whole.extend(script);
+        compare_inputs(&whole)?;
     }
 }
 

@@ -41,9 +41,11 @@ fn any_frame(frame: &Frame<'_>) {
         let again = frames([request.encode(frame.seq, &mut out).expect("fits")].into_iter());
         let (id, seq, body) = &again[0];
         assert_eq!(Request::decode(&Frame { id: *id, seq: *seq, body }), Ok(request.clone()));
-        if let Request::SetTiming(set) = request {
-            // Whatever the numbers, the validator comes to an answer.
-            let _ = set.timing.validate(&Limits::F350);
+        // Whatever the numbers, the validators come to an answer.
+        match request {
+            Request::SetTiming(set) => drop(set.timing.validate(&Limits::F350)),
+            Request::SetTriggerSource(set) => drop(set.source.validate()),
+            _ => {}
         }
     }
     if let Ok(message) = FromDevice::decode(frame) {

@@ -8,6 +8,7 @@ use stspp_protocol::message::{Event, Reply, Request};
 use stspp_protocol::reply::*;
 use stspp_protocol::request::*;
 use stspp_protocol::timing::{Limits, MAX_SLOTS, ProjectionTiming, Slot, TimingError, TimingField};
+use stspp_protocol::trigger::{ExternalTrigger, TriggerEdge, TriggerInput, TriggerSource};
 use stspp_protocol::version::*;
 
 /// Any timing, possible or not.
@@ -29,6 +30,14 @@ pub fn timing() -> impl Strategy<Value = ProjectionTiming> {
 
 fn version() -> impl Strategy<Value = ProtocolVersion> {
     any::<(u16, u16)>().prop_map(|(major, minor)| ProtocolVersion { major, minor })
+}
+
+fn source() -> impl Strategy<Value = TriggerSource> {
+    let edge = prop::sample::select(vec![TriggerEdge::Rising, TriggerEdge::Falling]);
+    prop::option::of((edge, any::<u32>())).prop_map(|external| match external {
+        None => TriggerSource::FreeRunning,
+        Some((edge, delay_us)) => TriggerSource::External(ExternalTrigger { edge, delay_us }),
+    })
 }
 
 pub fn request() -> impl Strategy<Value = Request> {
@@ -53,6 +62,8 @@ pub fn request() -> impl Strategy<Value = Request> {
         Just(Request::LoadDefaults(LoadDefaults)),
         Just(Request::Reset(Reset)),
         any::<u32>().prop_map(|key| Request::RebootToBootloader(RebootToBootloader { key })),
+        source().prop_map(|source| Request::SetTriggerSource(SetTriggerSource { source })),
+        Just(Request::GetTriggerSource(GetTriggerSource)),
     ]
 }
 
@@ -172,6 +183,7 @@ pub fn reply() -> impl Strategy<Value = Reply> {
         Just(Reply::SaveSettings(Done)),
         Just(Reply::Reset(Done)),
         Just(Reply::RebootToBootloader(Done)),
+        Just(Reply::SetTriggerSource(Done)),
     ];
     prop_oneof![
         simple,
@@ -193,6 +205,9 @@ pub fn reply() -> impl Strategy<Value = Reply> {
         report().prop_map(Reply::ClearFaults),
         active_timing().prop_map(Reply::LoadSettings),
         active_timing().prop_map(Reply::LoadDefaults),
+        (source(), any::<[u32; 2]>()).prop_map(|(source, [edges_taken, edges_ignored])| {
+            Reply::GetTriggerSource(TriggerInput { source, edges_taken, edges_ignored })
+        }),
     ]
 }
 
@@ -219,6 +234,7 @@ pub fn error() -> impl Strategy<Value = RequestError> {
         RequestField::BurstFrames,
         RequestField::FloodlightDurationUs,
         RequestField::BootloaderKey,
+        RequestField::TriggerDelayUs,
     ]);
     let storage =
         prop::sample::select(vec![StorageError::Empty, StorageError::Write, StorageError::Read]);

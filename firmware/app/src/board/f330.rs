@@ -9,7 +9,11 @@ pub(crate) const BOARD: BoardKind = BoardKind::F330;
 pub(crate) const CAPABILITIES: Capabilities = Capabilities::SETTINGS_STORE
     .union(Capabilities::BOOTLOADER)
     .union(Capabilities::FLOODLIGHT)
-    .union(Capabilities::TEMPERATURE);
+    .union(Capabilities::TEMPERATURE)
+    .union(Capabilities::TRIGGER_IN);
+
+/// Whether the chip of this board has a USB core.
+pub(crate) const HAS_USB: bool = false;
 
 /// There is no USB here.
 pub(crate) fn usb_sof() -> Option<u16> {

@@ -10,7 +10,11 @@ pub(crate) const CAPABILITIES: Capabilities = Capabilities::SETTINGS_STORE
     .union(Capabilities::BOOTLOADER)
     .union(Capabilities::FLOODLIGHT)
     .union(Capabilities::TEMPERATURE)
+    .union(Capabilities::TRIGGER_IN)
     .union(Capabilities::USB_SOF);
+
+/// Whether the chip of this board has a USB core.
+pub(crate) const HAS_USB: bool = true;
 
 /// Number of the host's last start-of-frame packet.
 pub(crate) fn usb_sof() -> Option<u16> {

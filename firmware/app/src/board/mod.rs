@@ -4,11 +4,11 @@
 #[cfg(feature = "board-f330")]
 mod f330;
 #[cfg(feature = "board-f330")]
-pub(crate) use f330::{BOARD, CAPABILITIES, spawn_link, usb_sof};
+pub(crate) use f330::{BOARD, CAPABILITIES, HAS_USB, spawn_link, usb_sof};
 #[cfg(feature = "board-f350")]
 mod f350;
 #[cfg(feature = "board-f350")]
-pub(crate) use f350::{BOARD, CAPABILITIES, spawn_link, usb_sof};
+pub(crate) use f350::{BOARD, CAPABILITIES, HAS_USB, spawn_link, usb_sof};
 
 #[cfg(not(any(feature = "board-f330", feature = "board-f350")))]
 compile_error!("choose a board: feature `board-f330` or `board-f350`");
@@ -36,6 +36,15 @@ pub(crate) const NTC_PULL_UP_OHM: u32 = 10_000;
 
 /// The settings' two pages: the last of the flash, beyond the program's area.
 pub(crate) const SETTINGS_PAGES: [u32; 2] = [126 * 1024, 127 * 1024];
+
+/// What the flashing tool looks for in the image: which board it is for.
+#[used]
+#[cfg_attr(feature = "board-f330", unsafe(export_name = "stspp_board_f330"))]
+#[cfg_attr(feature = "board-f350", unsafe(export_name = "stspp_board_f350"))]
+static BOARD_MARK: u32 = 0x5753_7453;
+
+/// EXTI line of trigger-in, PA1. Line 0 is the interlock's.
+pub(crate) const TRIGGER_LINE: u8 = 1;
 
 /// Makes all outputs low and driven; evaluates to the drivers. Before this, since reset, the pins
 /// float and the gates' pull-downs keep them off.

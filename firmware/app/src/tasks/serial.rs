@@ -9,13 +9,35 @@ use embassy_sync::mutex::Mutex;
 use static_cell::StaticCell;
 use stspp_protocol::wire::MAX_FRAME_LEN;
 
-/// The line, a frame at a time.
-pub(crate) type Line = Mutex<ThreadModeRawMutex, Writer<USART0>>;
+/// The line: who holds it sends the events that wait, then its own frame.
+pub(crate) type Line = Mutex<ThreadModeRawMutex, Wire>;
+
+/// What sends.
+pub(crate) struct Wire {
+    writer: Writer<USART0>,
+    event: [u8; MAX_FRAME_LEN],
+}
 
 /// Makes the writer shareable.
 pub(crate) fn share(writer: Writer<USART0>) -> &'static Line {
     static LINE: StaticCell<Line> = StaticCell::new();
-    LINE.init(Mutex::new(writer))
+    LINE.init(Mutex::new(Wire { writer, event: [0; MAX_FRAME_LEN] }))
+}
+
+impl Wire {
+    /// Events go before everything else: a host can ask again, but a label that was dropped costs a
+    /// frame. An event leaves the outbox only here, with the line in hand, so they stay in order.
+    async fn send_events(&mut self) {
+        while let Some(length) = shared::take_event(&mut self.event) {
+            write(&mut self.writer, &self.event[..length]).await;
+        }
+    }
+}
+
+async fn write(writer: &mut Writer<USART0>, frame: &[u8]) {
+    if let Err(error) = writer.write(frame).await {
+        defmt::error!("serial: {}", error);
+    }
 }
 
 struct Replies {
@@ -24,13 +46,9 @@ struct Replies {
 
 impl ReplySink for Replies {
     async fn send(&mut self, frame: &[u8]) {
-        write(self.line, frame).await;
-    }
-}
-
-async fn write(line: &'static Line, frame: &[u8]) {
-    if let Err(error) = line.lock().await.write(frame).await {
-        defmt::error!("serial: {}", error);
+        let mut wire = self.line.lock().await;
+        wire.send_events().await;
+        write(&mut wire.writer, frame).await;
     }
 }
 
@@ -59,12 +77,11 @@ pub(crate) async fn link(mut reader: Reader<USART0>, line: &'static Line) {
     }
 }
 
-/// Events.
+/// Events of a quiet line; on a busy one the replies take them along.
 #[embassy_executor::task]
 pub(crate) async fn events(line: &'static Line) {
-    let mut out = [0; MAX_FRAME_LEN];
     loop {
-        let length = shared::next_event(&mut out).await;
-        write(line, &out[..length]).await;
+        shared::EVENT.wait().await;
+        line.lock().await.send_events().await;
     }
 }

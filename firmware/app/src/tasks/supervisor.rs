@@ -1,9 +1,9 @@
 //! Time-outs, what interrupts found, and the watchdog.
 
-use crate::{safety, shared};
+use crate::{engine, safety, shared};
 use embassy_futures::select::select;
-use embassy_gd32f3x0::guard;
 use embassy_gd32f3x0::watchdog::Watchdog;
+use embassy_gd32f3x0::{guard, reset};
 use embassy_time::{Duration, Instant, Timer};
 use stspp_protocol::fault::FaultReason;
 
@@ -28,6 +28,12 @@ pub(crate) async fn run(mut watchdog: Watchdog<'static>) {
             if guard::take_tripped() {
                 let limit_us = crate::board::BOARD.limits().max_on_time_us as i32;
                 controller.on_fault(now_us, FaultReason::OnTime, limit_us, limit_us);
+            }
+            if reset::take_debug_halt() {
+                controller.on_debug_halt(now_us);
+            }
+            if let Some((made, planned)) = engine::tend() {
+                controller.on_fault(now_us, FaultReason::EdgeDma, made as i32, planned as i32);
             }
             controller.poll(now_us);
             controller.next_deadline_us()

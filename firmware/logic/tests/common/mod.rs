@@ -3,7 +3,7 @@
 
 use stspp_firmware_logic::controller::{Boot, Controller, Identity};
 use stspp_firmware_logic::hardware::{
-    Aborted, GateEngine, Page, SettingsStore, SlotDone, StoreError,
+    Aborted, GateEngine, Page, SettingsStore, SlotDone, StoreError, TriggerEdges,
 };
 use stspp_firmware_logic::timing::{GateWord, SlotPlan};
 use stspp_protocol::fault::FaultSet;
@@ -11,6 +11,7 @@ use stspp_protocol::message::{Call, Event, FromDevice, decode_reply, encode_requ
 use stspp_protocol::reply::RequestError;
 use stspp_protocol::request::{Arm, Hello};
 use stspp_protocol::timing::Slot;
+use stspp_protocol::trigger::TriggerSource;
 use stspp_protocol::version::{BoardKind, PROTOCOL_VERSION, ResetCause, SerialNumber};
 use stspp_protocol::wire::{FrameDecoder, MAX_FRAME_LEN};
 
@@ -22,6 +23,7 @@ pub enum Asked {
     Stop,
     ForceOff,
     Floodlight(u32),
+    TriggerSource(TriggerSource),
 }
 
 #[derive(Debug, Default)]
@@ -33,6 +35,8 @@ pub struct MockEngine {
     pub stops_after: u32,
     /// Answer to `force_off`.
     pub aborted: Aborted,
+    /// Answer to `trigger_edges`.
+    pub edges: TriggerEdges,
     /// Whether the floodlight's timer fails to end it.
     pub floodlight_stuck: bool,
 }
@@ -67,6 +71,14 @@ impl GateEngine for MockEngine {
 
     fn floodlight_is_on(&self) -> bool {
         self.floodlight_stuck
+    }
+
+    fn set_trigger_source(&mut self, source: TriggerSource) {
+        self.asked.push(Asked::TriggerSource(source));
+    }
+
+    fn trigger_edges(&self) -> TriggerEdges {
+        self.edges
     }
 }
 

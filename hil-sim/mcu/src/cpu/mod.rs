@@ -44,6 +44,13 @@ pub trait Cpu: Send {
     /// Sets the level of an interrupt input.
     fn set_irq(&mut self, irq: u16, high: bool);
 
+    /// Raises the non-maskable interrupt.
+    fn raise_nmi(&mut self);
+
+    /// Sets the debug fault status register: bit 0 after a halt by a debugger. Only a power-on and the
+    /// program itself clear it.
+    fn set_debug_events(&mut self, events: u32);
+
     /// Whether the core sleeps and nothing is pending that would wake it.
     fn is_idle(&self) -> bool;
 

@@ -86,7 +86,11 @@ pub struct RsemuCpu {
     core: ArmV7m,
     space: Arc<AddressSpace>,
     irqs: u128,
+    debug_events: u32,
 }
+
+/// The debug fault status register, which rsemu reads as 0 (it has no debug unit).
+const DFSR: u32 = 0xe000_ed30;
 
 /// Look-up of addresses by 16 KiB pages up to the USB core.
 const PAGES: DispatchPolicy = DispatchPolicy::Dense { page_bits: 14, cover: 0x5004_0000 };
@@ -132,7 +136,7 @@ impl RsemuCpu {
         }
         let space = Arc::new(space);
         let core = Self::fresh_core(&space);
-        Self { core, space, irqs: 0 }
+        Self { core, space, irqs: 0, debug_events: 0 }
     }
 
     fn fresh_core(space: &Arc<AddressSpace>) -> ArmV7m {
@@ -144,6 +148,53 @@ impl RsemuCpu {
 }
 
 impl RsemuCpu {
+    /// Whether the next instruction loads (true) or stores a word of [`DFSR`], and its register. The
+    /// forms that compilers use: immediate offsets and a register offset.
+    fn debug_access(&self) -> Option<(bool, u8)> {
+        let pc = u64::from(self.core.pc());
+        let half = |at| self.space.read(at, Width::U16, MemAttrs::DEBUG).unwrap_or(0) as u32;
+        let (first, second) = (half(pc), half(pc + 2));
+        let reg = |number: u32| self.core.reg(number as u8 & 15);
+        let (load, address, register) = match first >> 11 {
+            0b01100 | 0b01101 => {
+                let offset = (first >> 6 & 31) * 4;
+                (first >> 11 & 1, reg(first >> 3 & 7).wrapping_add(offset), first & 7)
+            }
+            0b01010 | 0b01011 if matches!(first >> 9, 0b010_1000 | 0b010_1100) => {
+                let address = reg(first >> 3 & 7).wrapping_add(reg(first >> 6 & 7));
+                (first >> 11 & 1, address, first & 7)
+            }
+            _ => {
+                let base = reg(first);
+                let address = match first & 0xffe0 {
+                    0xf8c0 => base.wrapping_add(second & 0xfff),
+                    0xf840 if second & 0xd00 == 0xc00 && second >> 9 & 1 == 0 => {
+                        base.wrapping_sub(second & 0xff)
+                    }
+                    _ => return None,
+                };
+                (first >> 4 & 1, address, second >> 12)
+            }
+        };
+        (address == DFSR).then_some((load != 0, register as u8))
+    }
+
+    /// One step of a program that may look at the debug events.
+    fn step_after_debug_event(&mut self) -> u64 {
+        let access = self.debug_access();
+        let stored = access.map_or(0, |(_, register)| self.core.reg(register));
+        let before = self.core.xpsr();
+        let cycles = self.core.step();
+        // An interrupt may have come instead of the instruction.
+        let executed = (self.core.xpsr() ^ before) & xpsr::EXCEPTION == 0;
+        match access.filter(|_| executed) {
+            Some((true, register)) => self.core.set_reg(register, self.debug_events),
+            Some((false, _)) => self.debug_events &= !stored,
+            None => {}
+        }
+        cycles
+    }
+
     /// rsemu 0.0.7 drops ITSTATE from the xPSR that exception entry stacks (the architecture keeps
     /// it: DDI 0403E B1.5.6), so what was left of an interrupted IT block would run unconditionally
     /// after the return. Where an interrupt came before the instruction at `pc` of an IT block, the
@@ -171,6 +222,9 @@ impl Cpu for RsemuCpu {
     fn step(&mut self) -> u64 {
         let before = self.core.xpsr();
         if before & xpsr::IT_MASK == 0 {
+            if self.debug_events != 0 {
+                return self.step_after_debug_event();
+            }
             return self.core.step();
         }
         let pc = self.core.pc();
@@ -182,6 +236,16 @@ impl Cpu for RsemuCpu {
     fn set_irq(&mut self, irq: u16, high: bool) {
         self.core.set_irq(irq, high);
         self.irqs = self.irqs & !(1 << irq) | u128::from(high) << irq;
+    }
+
+    fn raise_nmi(&mut self) {
+        self.core.with_sys(|sys| {
+            sys.set_pending(rsemu::cpu::arm::v7m::sys::Exception::NMI, true);
+        });
+    }
+
+    fn set_debug_events(&mut self, events: u32) {
+        self.debug_events = events;
     }
 
     fn is_idle(&self) -> bool {

@@ -38,8 +38,12 @@ pub enum Cause {
     OverTemperature,
     /// The temperature sensor breaks off.
     SensorOpen,
-    /// The DMA channel that ends a slot's light stops.
-    OnTime,
+    /// The DMA channel that makes the edges stops.
+    EdgeDma,
+    /// The timer that counts time and makes the edges stops.
+    TimerStops,
+    /// The crystal stops.
+    CrystalStops,
     /// The supply fails for a millisecond.
     BrownOut,
     /// The reset pin is pulled.
@@ -48,7 +52,7 @@ pub enum Cause {
 
 impl Cause {
     /// Every cause.
-    pub const ALL: [Cause; 13] = [
+    pub const ALL: [Cause; 15] = [
         Cause::Interlock,
         Cause::HeartbeatLost,
         Cause::UsbSuspend,
@@ -59,7 +63,9 @@ impl Cause {
         Cause::DebugHalt,
         Cause::OverTemperature,
         Cause::SensorOpen,
-        Cause::OnTime,
+        Cause::EdgeDma,
+        Cause::TimerStops,
+        Cause::CrystalStops,
         Cause::BrownOut,
         Cause::ResetPin,
     ];
@@ -84,7 +90,9 @@ impl Cause {
             Cause::DebugHalt => "debugger halts the processor",
             Cause::OverTemperature => "projectors too hot",
             Cause::SensorOpen => "temperature sensor open",
-            Cause::OnTime => "gate-off DMA stops",
+            Cause::EdgeDma => "edge DMA stops",
+            Cause::TimerStops => "edge and time base timer stops",
+            Cause::CrystalStops => "crystal stops",
             Cause::BrownOut => "supply fails",
             Cause::ResetPin => "reset pin pulled",
         }
@@ -105,7 +113,10 @@ impl Cause {
             // Two slots may be committed; each ends by itself or by the guard.
             (Cause::Hang | Cause::DebugHalt, _) => 150_000_000,
             (Cause::OverTemperature | Cause::SensorOpen, _) => 60_000_000,
-            (Cause::OnTime, _) => GUARD_NS,
+            // The supervisor comes round every 5 ms.
+            (Cause::EdgeDma, _) => 6_000_000,
+            (Cause::TimerStops, _) => GUARD_NS,
+            (Cause::CrystalStops, _) => 10_000,
             (Cause::BrownOut | Cause::ResetPin, _) => 1_000,
         }
     }
@@ -122,11 +133,13 @@ impl Cause {
             (Cause::Panic, _) => &[FaultReason::Panic],
             (Cause::HardFault, _) => &[FaultReason::HardFault],
             (Cause::Hang, _) => &[FaultReason::Watchdog],
-            (Cause::DebugHalt, _) => &[FaultReason::DebugHalt, FaultReason::Watchdog],
+            (Cause::DebugHalt, _) => &[FaultReason::DebugHalt],
             (Cause::OverTemperature, _) => &[FaultReason::OverTemperature],
             (Cause::SensorOpen, _) => &[FaultReason::TemperatureSensor],
-            // Whoever notices first: the guard, or the engine whose edge did not come.
-            (Cause::OnTime, _) => &[FaultReason::OnTime, FaultReason::Engine],
+            (Cause::EdgeDma, _) => &[FaultReason::EdgeDma],
+            // The guard's interrupt; or, where no task can run any more, the watchdog.
+            (Cause::TimerStops, _) => &[FaultReason::OnTime, FaultReason::Watchdog],
+            (Cause::CrystalStops, _) => &[FaultReason::Clock],
             (Cause::BrownOut | Cause::ResetPin, _) => &[],
         }
     }
@@ -157,7 +170,13 @@ impl Cause {
                 let channel = controller.board().thermistor_channel;
                 controller.chip().soc().adc.set_volts(channel, crate::soc::adc::VDDA_V);
             }
-            Cause::OnTime => {
+            Cause::TimerStops => {
+                // TIMER1_CTL0.CEN.
+                use crate::soc::peripheral::{Peripheral, TimerId};
+                controller.chip().act(|soc, cx| soc.timers[TimerId::T1.index()].write(0, 0, cx));
+            }
+            Cause::CrystalStops => controller.chip().set_crystal(false),
+            Cause::EdgeDma => {
                 controller.chip().act(|soc, cx| {
                     // Channel 3's control register, as a stray write would clear it.
                     use crate::soc::peripheral::Peripheral;

@@ -113,6 +113,7 @@ pub struct Soc {
     pin_levels: [[Level; 16]; 6],
     pin_changes: Vec<PinChange>,
     pending_reset: Option<ResetCause>,
+    pending_nmi: bool,
     signals: Vec<Signal>,
     clock_over_limit: bool,
     dma_channel_served: Option<u8>,
@@ -153,6 +154,7 @@ impl Soc {
             pin_levels: [[Level::Floating; 16]; 6],
             pin_changes: Vec::new(),
             pending_reset: None,
+            pending_nmi: false,
             signals: Vec::new(),
             clock_over_limit: false,
             dma_channel_served: None,
@@ -176,6 +178,16 @@ impl Soc {
     /// A reset that a model asked for since the last call.
     pub fn take_reset(&mut self) -> Option<ResetCause> {
         self.pending_reset.take()
+    }
+
+    /// Whether a model raised the non-maskable interrupt since the last call.
+    pub fn take_nmi(&mut self) -> bool {
+        std::mem::take(&mut self.pending_nmi)
+    }
+
+    /// The board's crystal stops or works (again).
+    pub fn set_crystal(&mut self, works: bool, now: u64) {
+        self.act(now, |soc, cx| soc.rcu.set_crystal(works, cx.out));
     }
 
     /// Takes the pin changes so far, in time order.
@@ -220,6 +232,7 @@ impl Soc {
         self.irq_levels = 0;
         self.timer_outputs = [[None; 7]; 7];
         self.pending_reset = None;
+        self.pending_nmi = false;
         self.with(now, |soc, cx| {
             soc.usbfs.core_reset(cx);
             for usart in &mut soc.usarts {

@@ -134,6 +134,8 @@ pub enum Signal {
     ClocksChanged,
     /// A peripheral reset bit was set.
     PeripheralReset(PeripheralId),
+    /// The non-maskable interrupt is raised.
+    Nmi,
     /// The core is to be reset.
     Reset(ResetCause),
 }

@@ -72,6 +72,10 @@ pub struct Rcu {
     pub crystal_fitted: bool,
     /// Whether this chip has the USB core (and its clock gate).
     has_usb: bool,
+    /// `CKMEN`: the crystal is watched.
+    monitor: bool,
+    /// `CKMIF`: the monitor has found it stopped.
+    stuck: bool,
 }
 
 impl Rcu {
@@ -118,6 +122,8 @@ impl Rcu {
             switched_to: 0,
             crystal_fitted,
             has_usb,
+            monitor: false,
+            stuck: false,
         }
     }
 
@@ -125,6 +131,29 @@ impl Rcu {
     #[must_use]
     pub fn reset_flags(&self) -> u32 {
         self.reset_flags
+    }
+
+    /// The crystal stops, or starts again. Where the monitor watches it, the core goes on from IRC8M
+    /// and gets an NMI (user manual, "HXTAL clock monitor"); what an unwatched clock that stops does
+    /// to the core is not modelled.
+    pub fn set_crystal(&mut self, works: bool, out: &mut Vec<Signal>) {
+        self.crystal_fitted = works;
+        if works || !self.monitor || self.hxtal.on_since_ns.is_none() {
+            return;
+        }
+        let from_crystal = self.cfg[0] >> 16 & 1 != 0 && self.cfg[1] >> 30 & 1 == 0;
+        self.hxtal.on_since_ns = None;
+        self.monitor = false;
+        self.stuck = true;
+        if self.switched_to == 1 || self.switched_to == 2 && from_crystal {
+            self.switched_to = 0;
+            self.cfg[0] &= !3;
+        }
+        if from_crystal {
+            self.pll.on_since_ns = None;
+        }
+        out.push(Signal::ClocksChanged);
+        out.push(Signal::Nmi);
     }
 
     /// Whether the clock of a peripheral is on, and the gate's name.
@@ -308,10 +337,11 @@ impl Peripheral for Rcu {
                     | osc(&self.irc8m, 0, 1)
                     | u32::from(self.hxtal.on_since_ns.is_some()) << 16
                     | u32::from(self.hxtal_stable(ns)) << 17
+                    | u32::from(self.monitor) << 19
                     | osc(&self.pll, 24, 25)
             }
             0x04 => self.cfg[0] & !0xc | self.switched_to << 2,
-            0x08 => self.int_enable,
+            0x08 => self.int_enable | u32::from(self.stuck) << 7,
             0x0c => self.apb2rst,
             0x10 => self.apb1rst,
             0x14 => self.ahben,
@@ -337,6 +367,7 @@ impl Peripheral for Rcu {
                 self.irc8m_adj = value & 0xf8;
                 self.irc8m.enable(value & 1 != 0 || self.switched_to == 0, ns);
                 self.hxtal.enable(value >> 16 & 1 != 0, ns);
+                self.monitor = value >> 19 & 1 != 0;
                 self.pll.enable(value >> 24 & 1 != 0 || self.switched_to == 2, ns);
             }
             0x04 => {
@@ -351,7 +382,8 @@ impl Peripheral for Rcu {
                 Self::reset_pulse(1, self.apb1rst, value, cx.out);
                 self.apb1rst = value;
             }
-            0x14 => self.ahben = value,
+            // The gate of what is not there cannot be opened (inferred).
+            0x14 => self.ahben = value & !(u32::from(!self.has_usb) << 12),
             0x18 => self.apb2en = value,
             0x1c => self.apb1en = value,
             0x24 => {
@@ -394,13 +426,14 @@ impl Peripheral for Rcu {
         let usb = u32::from(self.has_usb) << 12;
         Some(match offset {
             // Bits that hardware sets may be written back.
-            0x00 => 0x0303_fffb,
+            0x00 => 0x030b_fffb,
             // CKOUT is not routed to a pin.
             0x04 => 0x08ff_ffff,
             0x08 => 0,
             0x0c => 0x0007_4a01,
             0x10 => 0x1002_0103,
-            0x14 => 0x005e_0055 | usb,
+            // Firmware asks for the gate of USBFS to find out which chip it runs on.
+            0x14 => 0x005e_1055,
             0x18 => 0x0007_4a01,
             0x1c => 0x1002_0103,
             0x24 => 0xff80_0003,

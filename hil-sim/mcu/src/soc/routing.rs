@@ -64,6 +64,10 @@ impl Soc {
             Signal::DmaRemap(cfg0) => self.dma.set_remap(cfg0),
             Signal::ClocksChanged => self.change_clocks(now),
             Signal::PeripheralReset(id) => self.reset_peripheral(id, now),
+            Signal::Nmi => {
+                self.pending_nmi = true;
+                self.shared.attention.store(true, Ordering::Relaxed);
+            }
             Signal::Reset(cause) => {
                 self.pending_reset.get_or_insert(cause);
                 self.shared.attention.store(true, Ordering::Relaxed);

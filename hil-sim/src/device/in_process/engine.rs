@@ -3,9 +3,10 @@
 //! The timer counts microseconds of the device's clock. Edges come out exactly where the plan's
 //! compare values put them.
 
-use stspp_firmware_logic::hardware::{Aborted, GateEngine, SlotDone};
+use stspp_firmware_logic::hardware::{Aborted, GateEngine, SlotDone, TriggerEdges};
 use stspp_firmware_logic::runner::START_LEAD_US;
 use stspp_firmware_logic::timing::{GateWord, SlotPlan};
+use stspp_protocol::trigger::{TriggerEdge, TriggerSource};
 use stspp_protocol::usb::SOF_MODULUS;
 
 use super::clock::DeviceClock;
@@ -22,6 +23,8 @@ enum Phase {
     TriggerOff,
     GateOff,
     Boundary,
+    /// No slot is under way; the next one waits for an edge at trigger-in.
+    Waiting,
 }
 
 #[derive(Debug, Clone)]
@@ -31,6 +34,20 @@ struct Run {
     slot_index: usize,
     end: Option<u32>,
     phase: Phase,
+    /// Slots start by edges at trigger-in.
+    external: bool,
+    /// Start of the slot that an edge has asked for.
+    asked_us: Option<u64>,
+    /// The soonest that an edge's slot may start.
+    soonest_us: u64,
+}
+
+impl Run {
+    /// Slots that have begun, or that an edge has asked for.
+    fn slots_begun(&self) -> u32 {
+        let under_way = self.phase != Phase::Waiting;
+        self.slot_number + u32::from(under_way) + u32::from(self.asked_us.is_some())
+    }
 }
 
 /// Gate engine of the in-process device.
@@ -48,6 +65,10 @@ pub struct VirtualEngine {
     triggers: bool,
     edges: Vec<PinEdge>,
     stalls_at_next_slot: bool,
+    source: TriggerSource,
+    trigger_in: bool,
+    taken: u32,
+    ignored: u32,
 }
 
 impl VirtualEngine {
@@ -65,6 +86,36 @@ impl VirtualEngine {
             triggers: false,
             edges: Vec::new(),
             stalls_at_next_slot: false,
+            source: TriggerSource::FreeRunning,
+            trigger_in: false,
+            taken: 0,
+            ignored: 0,
+        }
+    }
+
+    /// The level at trigger-in, from now on.
+    pub fn set_trigger_in(&mut self, high: bool) {
+        if std::mem::replace(&mut self.trigger_in, high) == high {
+            return;
+        }
+        let TriggerSource::External(external) = self.source else { return };
+        if high != (external.edge == TriggerEdge::Rising) {
+            return;
+        }
+        let start_us = self.time_us() + u64::from(external.delay_us);
+        let Some(run) = self.run.as_mut().filter(|run| run.external) else { return };
+        if run.end.is_some_and(|end| run.slots_begun() >= end) {
+            return;
+        }
+        if start_us >= run.soonest_us && run.asked_us.is_none() {
+            run.asked_us = Some(start_us);
+            self.taken = self.taken.wrapping_add(1);
+            if run.slot_number == 0 && run.phase == Phase::Waiting {
+                // The first slot of a run is under way from now on: no plan takes over before it.
+                self.settle_cycle();
+            }
+        } else {
+            self.ignored = self.ignored.wrapping_add(1);
         }
     }
 
@@ -100,13 +151,14 @@ impl VirtualEngine {
 
     fn next_event_us(&self) -> Option<u64> {
         let run_us = match (&self.run, &self.plan) {
+            (Some(run), Some(_)) if run.phase == Phase::Waiting => run.asked_us,
             (Some(run), Some(plan)) => {
                 let ticks = match run.phase {
                     Phase::GateOn => plan.gate_on_ticks(),
                     Phase::TriggerOn => plan.trigger_on_ticks(),
                     Phase::TriggerOff => plan.trigger_off_ticks(),
                     Phase::GateOff => plan.gate_off_ticks(),
-                    Phase::Boundary => plan.period_ticks(),
+                    Phase::Boundary | Phase::Waiting => plan.period_ticks(),
                 };
                 Some(run.slot_start_us + u64::from(ticks / plan.ticks_per_us()))
             }
@@ -124,6 +176,10 @@ impl VirtualEngine {
         if self.floodlight_until_us == Some(time_us) {
             self.floodlight_until_us = None;
             self.set_gates(time_ns, GateWord::DARK);
+            return None;
+        }
+        if self.run.as_ref()?.phase == Phase::Waiting {
+            self.begin_external_slot(time_us);
             return None;
         }
         let (run, plan) = (self.run.as_mut()?, self.plan.as_ref()?);
@@ -148,12 +204,44 @@ impl VirtualEngine {
                 run.phase = Phase::Boundary;
                 let done = self.slot_done(gates);
                 self.set_gates(time_ns, GateWord::DARK);
+                if let Some(run) = self.run.as_mut().filter(|run| run.external) {
+                    run.phase = Phase::Waiting;
+                    run.slot_number += 1;
+                    run.slot_index += 1;
+                }
                 done
             }
-            Phase::Boundary => {
+            Phase::Boundary | Phase::Waiting => {
                 self.next_slot(time_us);
                 None
             }
+        }
+    }
+
+    /// Starts the slot that an edge at trigger-in has asked for.
+    fn begin_external_slot(&mut self, time_us: u64) {
+        let Some(run) = &mut self.run else { return };
+        run.asked_us = None;
+        run.slot_start_us = time_us;
+        run.phase = Phase::GateOn;
+        if run.slot_number > 0 {
+            self.settle_cycle();
+        }
+        if let (Some(run), Some(plan)) = (&mut self.run, &self.plan) {
+            run.soonest_us = time_us + u64::from(plan.period_ticks() / plan.ticks_per_us());
+        }
+    }
+
+    /// At the end of a cycle the next one begins, under a new plan where one waits.
+    fn settle_cycle(&mut self) {
+        let Some(run) = &mut self.run else { return };
+        if self.plan.as_ref().is_none_or(|plan| run.slot_index >= plan.gates().len()) {
+            run.slot_index = 0;
+        }
+        if run.slot_index == 0
+            && let Some(pending) = self.pending.take()
+        {
+            self.plan = Some(pending);
         }
     }
 
@@ -191,12 +279,7 @@ impl VirtualEngine {
         run.slot_number += 1;
         run.slot_index += 1;
         run.phase = Phase::GateOn;
-        if self.plan.as_ref().is_none_or(|plan| run.slot_index >= plan.gates().len()) {
-            run.slot_index = 0;
-            if let Some(pending) = self.pending.take() {
-                self.plan = Some(pending);
-            }
-        }
+        self.settle_cycle();
     }
 
     fn set_gates(&mut self, time_ns: u64, gates: GateWord) {
@@ -244,19 +327,35 @@ impl GateEngine for VirtualEngine {
         if let Some(pending) = self.pending.take() {
             self.plan = Some(pending);
         }
-        let start_us = self.time_us() + START_LEAD_US;
+        let external = self.source != TriggerSource::FreeRunning;
+        let start_us = self.time_us() + if external { 0 } else { START_LEAD_US };
         self.run = Some(Run {
             slot_start_us: start_us,
             slot_number: 0,
             slot_index: 0,
             end: slots,
-            phase: Phase::GateOn,
+            phase: if external { Phase::Waiting } else { Phase::GateOn },
+            external,
+            asked_us: None,
+            soonest_us: start_us,
         });
         start_us
     }
 
     fn stop(&mut self) -> u32 {
         let Some(run) = &mut self.run else { return 0 };
+        if run.external {
+            // A slot that has not begun is taken back, but for the first.
+            if run.slots_begun() > 1 {
+                run.asked_us = None;
+            }
+            let slots = run.slots_begun();
+            run.end = Some(slots);
+            if run.phase == Phase::Waiting && run.asked_us.is_none() {
+                self.run = None;
+            }
+            return slots;
+        }
         let slots = run.slot_number + 1;
         if run.phase == Phase::Boundary {
             self.run = None;
@@ -269,7 +368,8 @@ impl GateEngine for VirtualEngine {
     fn force_off(&mut self) -> Aborted {
         let aborted = match (self.run.take(), &self.plan) {
             (Some(run), Some(plan)) => {
-                let triggered = u32::from(run.phase > Phase::TriggerOn);
+                let risen = run.phase > Phase::TriggerOn && run.phase != Phase::Waiting;
+                let triggered = u32::from(risen);
                 let is_lit = run.phase > Phase::GateOn && run.phase < Phase::Boundary;
                 let on_since_us =
                     run.slot_start_us + u64::from(plan.gate_on_ticks() / plan.ticks_per_us());
@@ -300,5 +400,18 @@ impl GateEngine for VirtualEngine {
 
     fn floodlight_is_on(&self) -> bool {
         self.run.is_none() && self.gates.floodlight()
+    }
+
+    fn set_trigger_source(&mut self, source: TriggerSource) {
+        self.source = source;
+    }
+
+    fn trigger_edges(&self) -> TriggerEdges {
+        let run = self.run.as_ref().filter(|run| run.external);
+        let slot_under_way_us = run.and_then(|run| match run.phase {
+            Phase::Waiting => run.asked_us,
+            _ => Some(run.slot_start_us),
+        });
+        TriggerEdges { taken: self.taken, ignored: self.ignored, slot_under_way_us }
     }
 }
