@@ -9,13 +9,14 @@ use std::time::Duration;
 
 use serde::Serialize;
 use stspp_protocol::fault::FaultReport;
-use stspp_protocol::reply::Status;
+use stspp_protocol::reply::{RequestError, Status};
 use stspp_protocol::request::{
-    ClearFaults, FloodlightOff, FloodlightOn, GetFaults, GetStatus, GetTiming, LoadDefaults,
-    LoadSettings, SaveSettings, SetTiming,
+    ClearFaults, FloodlightOff, FloodlightOn, GetFaults, GetStatus, GetTiming, GetTriggerSource,
+    LoadDefaults, LoadSettings, SaveSettings, SetTiming, SetTriggerSource,
 };
 use stspp_protocol::timing::Limits;
-use stspp_protocol::version::{DeviceInfo, PROTOCOL_VERSION};
+use stspp_protocol::trigger::{TriggerInput, TriggerSource};
+use stspp_protocol::version::{Capabilities, DeviceInfo, PROTOCOL_VERSION};
 
 use crate::camera::CameraSource;
 use crate::clock::{Clock, MonotonicClock};
@@ -209,6 +210,42 @@ impl Sensor {
             }
         }
         session.set_timing(&SetTiming { timing })
+    }
+
+    /// What starts slots, and the edges seen at trigger-in.
+    ///
+    /// # Errors
+    /// When the device has no trigger-in or does not answer; for a recording.
+    pub fn trigger_input(&self) -> Result<TriggerInput, Error> {
+        self.has_trigger_in("GetTriggerSource")?;
+        self.session("have a trigger input")?.link().call(&GetTriggerSource)
+    }
+
+    /// Chooses what starts the slots of the streams to come: the device's own timer, or edges at its
+    /// trigger-in. Not while streaming. The device forgets it with the session.
+    ///
+    /// A stream by an external trigger waits for edges as long as its reader does.
+    ///
+    /// # Errors
+    /// When the device has no trigger-in, or the delay is out of range; nothing has changed then.
+    pub fn set_trigger_source(&mut self, source: TriggerSource) -> Result<(), Error> {
+        let request = "SetTriggerSource";
+        self.has_trigger_in(request)?;
+        source.validate().map_err(|source| Error::Refused { request, source })?;
+        let session = self.session("have a trigger input")?;
+        session.link().call(&SetTriggerSource { source }).map(drop)
+    }
+
+    /// A request that was added to the protocol goes only to a device that says it has it.
+    fn has_trigger_in(&self, request: &'static str) -> Result<(), Error> {
+        match &self.backend {
+            Backend::Live { device, .. }
+                if !device.capabilities.contains(Capabilities::TRIGGER_IN) =>
+            {
+                Err(Error::Refused { request, source: RequestError::Unsupported })
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Stores the timing on the device for its next power-on. Not while streaming.

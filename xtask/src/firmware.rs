@@ -1,5 +1,5 @@
 //! `cargo xtask firmware`: builds the firmware for both boards, prints flash and RAM, fails over
-//! budget; `cargo xtask firmware --test` runs the tests of the HAL's arithmetic on the host.
+//! budget; `--exercise` adds a small program for tests of the HAL; `cargo xtask firmware --test` runs the tests of the HAL's arithmetic on the host.
 //!
 //! The chip's target needs a core library. Two ways to one, tried in this order with the compiler
 //! on PATH and with Debian's /usr/bin/rustc: the prebuilt one of `rustup target add`, or the
@@ -44,18 +44,20 @@ pub struct Image {
 /// # Errors
 /// Says what is missing or over budget, and what to do about it.
 pub fn run(arguments: &[&str]) -> Result<String, String> {
-    let (mut install, mut test, mut boards) = (false, false, Vec::new());
+    let (mut install, mut test, mut exercise, mut boards) = (false, false, false, Vec::new());
     for &argument in arguments {
         match argument {
             "--install" => install = true,
             "--test" => test = true,
+            "--exercise" => exercise = true,
             board if BOARDS.contains(&board) => boards.push(board),
             other => {
                 return Err(format!(
                     "firmware: unknown argument `{other}`\n\
-                     cargo xtask firmware [f330] [f350] [--install] [--test]\n\
-                     --install  gets the compiler's target (rustup, or Debian packages as root)\n\
-                     --test     instead runs the host tests of the HAL's arithmetic"
+                     cargo xtask firmware [f330] [f350] [--install] [--exercise] [--test]\n\
+                     --install   gets the compiler's target (rustup, or Debian packages as root)\n\
+                     --exercise  also builds the program that the HAL's emulator tests run\n\
+                     --test      instead runs the host tests of the HAL's arithmetic"
                 ));
             }
         }
@@ -66,24 +68,27 @@ pub fn run(arguments: &[&str]) -> Result<String, String> {
     if boards.is_empty() {
         boards.extend(BOARDS);
     }
-    build_all(&toolchain::find(install)?, &boards)
+    build_all(&toolchain::find(install)?, &boards, exercise)
 }
 
 /// Both boards as a stage of the test command: skipped only where no compiler can be had.
 pub fn stage() -> Outcome {
     match toolchain::find(true) {
         Err(why) => Outcome::Skipped(why),
-        Ok(toolchain) => stage::check(build_all(&toolchain, &BOARDS)),
+        Ok(toolchain) => stage::check(build_all(&toolchain, &BOARDS, true)),
     }
 }
 
-fn build_all(toolchain: &Toolchain, boards: &[&str]) -> Result<String, String> {
+fn build_all(toolchain: &Toolchain, boards: &[&str], exercise: bool) -> Result<String, String> {
     println!("{toolchain}");
     let mut report = String::new();
     for &board in boards {
         let image = build(toolchain, board)?;
         report += &describe(board, &image);
         within_budget(board, &image).map_err(|over| format!("{report}{over}"))?;
+        if exercise {
+            build_program(toolchain, board, "stspp-exercise", &format!("exercise-{board}.elf"))?;
+        }
     }
     Ok(report.trim_end().to_owned())
 }
@@ -97,18 +102,29 @@ fn firmware() -> PathBuf {
 /// # Errors
 /// When the compiler fails or the ELF cannot be read.
 pub fn build(toolchain: &Toolchain, board: &str) -> Result<Image, String> {
+    build_program(toolchain, board, "stspp-firmware", &format!("{board}.elf"))
+}
+
+/// Builds a program of the firmware's workspace for one board and copies its ELF to
+/// `target/firmware/<file>`.
+fn build_program(
+    toolchain: &Toolchain,
+    board: &str,
+    program: &str,
+    file: &str,
+) -> Result<Image, String> {
     let mut cargo = toolchain.cargo();
     cargo
         .current_dir(firmware())
-        .args(["build", "--release", "--locked", "--target", TARGET, "-p", "stspp-firmware"])
+        .args(["build", "--release", "--locked", "--target", TARGET, "-p", program])
         .args(["--features", &format!("board-{board}")])
         .args(["--config", &short_paths()?]);
     toolchain.finish(&mut cargo);
     done(&mut cargo, "the firmware does not build")?;
 
-    let built = firmware().join("target").join(TARGET).join("release/stspp-firmware");
+    let built = firmware().join("target").join(TARGET).join("release").join(program);
     let folder = workspace::root().join("target/firmware");
-    let elf = folder.join(format!("{board}.elf"));
+    let elf = folder.join(file);
     std::fs::create_dir_all(&folder).map_err(|e| format!("{}: {e}", folder.display()))?;
     std::fs::copy(&built, &elf).map_err(|e| format!("{}: {e}", built.display()))?;
     let bytes = std::fs::read(&elf).map_err(|e| format!("{}: {e}", elf.display()))?;
