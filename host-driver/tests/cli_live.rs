@@ -105,7 +105,7 @@ fn the_simulated_sensor_is_always_listed() {
 #[test]
 fn info_shows_versions_state_and_timing() {
     let info = succeeds(&["info", "-s", "sim:plane?scale=8"]);
-    for part in ["source    sim:plane?scale=8", "protocol 1.0", "160x128", "state     idle"] {
+    for part in ["source    sim:plane?scale=8", "protocol 1.1", "160x128", "state     idle"] {
         assert!(info.contains(part), "{part} in\n{info}");
     }
     let info = json(&["info", "--json", "-s", "sim:plane?scale=8"]);
