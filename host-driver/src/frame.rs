@@ -87,6 +87,9 @@ pub struct PointCloud {
     pub zncc: Vec<f32>,
     /// Brightness per point, as many as points.
     pub intensity: Vec<u8>,
+    /// Speed along +z per point in metres per second, as many as points; empty where motion is not
+    /// estimated.
+    pub depth_rate_m_per_s: Vec<f32>,
 }
 
 impl PointCloud {
@@ -96,6 +99,7 @@ impl PointCloud {
             points_left_m: Vec::with_capacity(points),
             zncc: Vec::with_capacity(points),
             intensity: Vec::with_capacity(points),
+            depth_rate_m_per_s: Vec::new(),
         }
     }
 

@@ -75,6 +75,7 @@ pub(crate) fn point_cloud(frame: &DepthFrame) -> PointCloud {
             let mut cloud = PointCloud::default();
             for y in band * BAND..((band + 1) * BAND).min(frame.disparity_px.height()) {
                 let (zncc, intensity) = (frame.zncc.row(y), frame.intensity.row(y));
+                let rate = frame.depth_rate_m_per_s.as_ref().map(|rate| rate.row(y));
                 for (x, &d) in frame.disparity_px.row(y).iter().enumerate() {
                     let scale = reprojection.scale(d);
                     if scale.is_finite() {
@@ -82,6 +83,7 @@ pub(crate) fn point_cloud(frame: &DepthFrame) -> PointCloud {
                         cloud.points_left_m.push(point.cast());
                         cloud.zncc.push(zncc[x]);
                         cloud.intensity.push(intensity[x]);
+                        cloud.depth_rate_m_per_s.extend(rate.map(|rate| rate[x]));
                     }
                 }
             }
@@ -93,6 +95,7 @@ pub(crate) fn point_cloud(frame: &DepthFrame) -> PointCloud {
         cloud.points_left_m.extend(band.points_left_m);
         cloud.zncc.extend(band.zncc);
         cloud.intensity.extend(band.intensity);
+        cloud.depth_rate_m_per_s.extend(band.depth_rate_m_per_s);
     }
     cloud
 }

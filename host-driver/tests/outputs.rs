@@ -19,7 +19,23 @@ fn cloud() -> PointCloud {
         points_left_m: vec![Point3::new(0.125, -0.25, 1.5), Point3::new(1.0, 2.0, 3.0)],
         zncc: vec![0.75, 1.0],
         intensity: vec![7, 255],
+        depth_rate_m_per_s: Vec::new(),
     }
+}
+
+#[test]
+fn a_cloud_with_speeds_has_them_as_a_property_more() {
+    let with = PointCloud { depth_rate_m_per_s: vec![-0.009, 0.0], ..cloud() };
+    let (with_bytes, without_bytes) = (ply_bytes(&with), ply_bytes(&cloud()));
+    let header = String::from_utf8_lossy(&with_bytes);
+    assert!(header.contains("property uchar intensity\nproperty float depth_rate\nend_header"));
+    assert!(header.contains("comment depth_rate is the speed along +z in metre per second\n"));
+    assert_eq!(with_bytes[with_bytes.len() - 4..], 0.0_f32.to_le_bytes());
+    let point = with_bytes.len() - 2 * 21;
+    assert_eq!(with_bytes[point + 17..point + 21], (-0.009_f32).to_le_bytes());
+    // Readers that do not know the property skip it.
+    let read = |bytes: &[u8]| ply::read(&mut Cursor::new(bytes)).unwrap();
+    assert_eq!(read(&with_bytes), read(&without_bytes));
 }
 
 fn ply_bytes(cloud: &PointCloud) -> Vec<u8> {
@@ -287,6 +303,7 @@ proptest! {
             points_left_m: points.iter().map(|p| Point3::from(p.0)).collect(),
             zncc: points.iter().map(|p| p.1).collect(),
             intensity: points.iter().map(|p| p.2).collect(),
+            depth_rate_m_per_s: Vec::new(),
         };
         let back = ply::read(&mut Cursor::new(ply_bytes(&cloud))).unwrap();
         // NaN compares by its bits.

@@ -67,15 +67,29 @@ pub fn write_zncc_png(out: &mut dyn Write, zncc: &Image<f32>) -> io::Result<()> 
 /// # Errors
 /// From `out`.
 pub fn write_disparity_tiff(out: &mut dyn Write, disparity_px: &Image<f32>) -> io::Result<()> {
+    let text = "Disparity x_left - x_right in px of the rectified canvas, NaN is invalid";
+    write_float_tiff(out, disparity_px, text)
+}
+
+/// Speed along depth as 32-bit float TIFF in metres per second, NaN is invalid.
+///
+/// # Errors
+/// From `out`.
+pub fn write_depth_rate_tiff(out: &mut dyn Write, rate_m_per_s: &Image<f32>) -> io::Result<()> {
+    let text =
+        "Speed along +z of the left camera in m/s (positive: away), 0 at rest, NaN is invalid";
+    write_float_tiff(out, rate_m_per_s, text)
+}
+
+fn write_float_tiff(out: &mut dyn Write, map: &Image<f32>, text: &str) -> io::Result<()> {
     let size = |side: usize| u32::try_from(side).map_err(io::Error::other);
-    let (width, height) = (size(disparity_px.width())?, size(disparity_px.height())?);
-    let mut file = io::Cursor::new(Vec::with_capacity(disparity_px.as_slice().len() * 4 + 4096));
+    let (width, height) = (size(map.width())?, size(map.height())?);
+    let mut file = io::Cursor::new(Vec::with_capacity(map.as_slice().len() * 4 + 4096));
     let written = || -> tiff::TiffResult<()> {
         let mut encoder = TiffEncoder::new(&mut file)?;
         let mut image = encoder.new_image::<Gray32Float>(width, height)?;
-        let text = "Disparity x_left - x_right in px of the rectified canvas, NaN is invalid";
         image.encoder().write_tag(Tag::ImageDescription, text)?;
-        image.write_data(disparity_px.as_slice())
+        image.write_data(map.as_slice())
     };
     let mut written = written;
     written().map_err(io::Error::other)?;

@@ -6,8 +6,16 @@ use super::folder::{OutputError, OutputFolder};
 use super::{images, ply};
 use crate::DepthFrame;
 
-/// Writes `cloud.ply`, `disparity.tiff`, `depth.png`, `depth_color.png`, `zncc.png` and `report.json`.
-/// `progress` is told each file.
+/// Outputs that are not always wanted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Extras {
+    /// The speed along depth, where motion is estimated: `depth_rate.tiff` (f32, metres per second,
+    /// positive away from the sensor, NaN invalid), and a property of the cloud's points.
+    pub depth_rate: bool,
+}
+
+/// Writes `cloud.ply`, `disparity.tiff`, `depth.png`, `depth_color.png`, `zncc.png` and `report.json`,
+/// and what `extras` asks for. `progress` is told each file.
 ///
 /// # Errors
 /// From the file system.
@@ -15,10 +23,14 @@ pub fn write(
     out: &mut OutputFolder,
     frame: &DepthFrame,
     report: &Value,
+    extras: Extras,
     progress: &mut dyn FnMut(&'static str),
 ) -> Result<(), OutputError> {
     progress("cloud.ply");
-    let cloud = frame.point_cloud();
+    let mut cloud = frame.point_cloud();
+    if !extras.depth_rate {
+        cloud.depth_rate_m_per_s.clear();
+    }
     out.file("cloud.ply", |w| ply::write(w, &cloud))?;
     drop(cloud);
     progress("disparity.tiff");
@@ -30,6 +42,10 @@ pub fn write(
     out.file("depth_color.png", |w| images::write_depth_colour_png(w, &frame.depth_m, range_m))?;
     progress("zncc.png");
     out.file("zncc.png", |w| images::write_zncc_png(w, &frame.zncc))?;
+    if let Some(rate) = frame.depth_rate_m_per_s.as_ref().filter(|_| extras.depth_rate) {
+        progress("depth_rate.tiff");
+        out.file("depth_rate.tiff", |w| images::write_depth_rate_tiff(w, rate))?;
+    }
     progress("report.json");
     out.file("report.json", |w| writeln!(w, "{report:#}"))
 }

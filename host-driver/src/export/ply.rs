@@ -1,5 +1,5 @@
 //! Point clouds as binary PLY: float x y z in metres in the left camera's frame, float zncc, uchar
-//! intensity.
+//! intensity, and float depth_rate in metres per second along +z where the cloud has it.
 
 use std::io::{self, BufRead, Write};
 
@@ -11,32 +11,45 @@ use crate::PointCloud;
 const HEADER_LINES_MAX: usize = 200;
 /// Longest header line that is read, in bytes.
 const HEADER_LINE_MAX: u64 = 1024;
-/// Bytes of a point as [`write`] writes it.
-const POINT_BYTES: usize = 17;
+/// Most bytes of a point as [`write`] writes it.
+const POINT_BYTES: usize = 21;
 
 /// Writes a cloud.
 ///
 /// # Errors
 /// From `out`.
 pub fn write(out: &mut dyn Write, cloud: &PointCloud) -> io::Result<()> {
+    let rates = &cloud.depth_rate_m_per_s;
+    let (comment, property) = if rates.is_empty() {
+        ("", "")
+    } else {
+        (
+            "comment depth_rate is the speed along +z in metre per second\n",
+            "property float depth_rate\n",
+        )
+    };
     write!(
         out,
         "ply\nformat binary_little_endian 1.0\n\
          comment unit metre\n\
          comment frame left camera (cam0, unrectified) optical: +x right, +y down, +z forward\n\
          comment zncc is the similarity of the matched subset, intensity that of the left camera\n\
+         {comment}\
          element vertex {}\n\
          property float x\nproperty float y\nproperty float z\n\
-         property float zncc\nproperty uchar intensity\nend_header\n",
+         property float zncc\nproperty uchar intensity\n{property}end_header\n",
         cloud.len()
     )?;
     let mut bytes = Vec::with_capacity(POINT_BYTES * 4096);
     let points = cloud.points_left_m.iter().zip(&cloud.zncc).zip(&cloud.intensity);
-    for ((point, zncc), intensity) in points {
+    for (i, ((point, zncc), intensity)) in points.enumerate() {
         for value in [point.x, point.y, point.z, *zncc] {
             bytes.extend_from_slice(&value.to_le_bytes());
         }
         bytes.push(*intensity);
+        if let Some(rate) = rates.get(i) {
+            bytes.extend_from_slice(&rate.to_le_bytes());
+        }
         if bytes.len() + POINT_BYTES > bytes.capacity() {
             out.write_all(&bytes)?;
             bytes.clear();

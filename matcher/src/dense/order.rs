@@ -1,5 +1,18 @@
-//! The order per pixel: the first where the surface is flat within a window, the second where it is
-//! curved, told by the smoothed difference of the two estimates.
+//! The order and the window per pixel.
+//!
+//! A first-order fit has half the second's noise, and where the surface is curved a bias of 6.7 times
+//! half the curvature (9 x 9 pixels), which is what the difference e of the two estimates measures.
+//! Curvature changes slowly, so that e is smoothed before it is used:
+//!
+//! - calm: first order + mean of e over 13 x 13 pixels. A quadratic surface comes out as it is, with 1.10
+//!   times the first order's noise, where the second order has 1.90; where the mean is noise it is left
+//!   out.
+//! - calm and wide: over 5 x 5 pixels in addition, where that changes nothing but noise: 0.82 times the
+//!   first order's noise on flat surfaces, 0.97 on curved ones. Averaging adds 0.3 of the bias, which
+//!   is taken off likewise.
+//! - rough: the second order, where e scatters more than by noise: edges and ridges within the window.
+//!
+//! What is noise is told by the median of changes of e over the image, scaled by each pixel's ZNCC.
 
 use std::sync::Mutex;
 
@@ -16,12 +29,27 @@ use crate::{
 
 /// Radius of the smoothing: 13 x 13 pixels.
 const RADIUS: usize = 6;
-/// Differences below this many standard deviations of the unsmoothed difference are noise...
-const FLAT: f32 = 0.7;
-/// ...and above this many curvature; between the two, both estimates are blended.
-const CURVED: f32 = 1.2;
-/// Bounds of the standard deviation in px.
-const SIGMA_PX: [f32; 2] = [0.002, 0.02];
+/// Radius of the wide average: 5 x 5 pixels.
+const WIDE: usize = 2;
+/// What the wide average adds to the bias of first order: 2 to 6.67.
+const WIDE_BIAS: f32 = 0.3;
+/// Fewest valid pixels under the smoothing; with fewer an edge is near.
+const WHOLE: f32 = 130.0;
+/// Near edges: means below and above so many standard deviations of e are of flat and of curved surfaces.
+/// Between the two, here and below, both estimates are blended.
+const EDGE: (f32, f32) = (0.7, 1.2);
+/// Means below and above so many standard deviations are noise and bias; a mean of noise has 0.12.
+const BIAS: (f32, f32) = (0.25, 0.5);
+/// Changes by the wide average below and above so many are noise and shape; of noise they have 0.26.
+const SHAPE: (f32, f32) = (0.9, 1.5);
+/// Variances of e below and above so many of noise's are calm and rough; of noise 99.99 % are below 2.3.
+const ROUGH: (f32, f32) = (2.4, 4.0);
+/// Bounds of the image's standard deviation of e in px.
+const SIGMA_PX: (f32, f32) = (0.002, 0.05);
+/// Least loss of ZNCC that counts: below, it is rounding.
+const LOSS_MIN: f32 = 1e-4;
+/// Rows under the smoothing.
+const SIDE: usize = 2 * RADIUS + 1;
 /// Rows of a task.
 const BAND: usize = 64;
 
@@ -34,12 +62,21 @@ pub struct OrderChoice {
 
 #[derive(Debug, Default)]
 struct Buffers {
-    /// Differences and their validity, by row modulo the window.
-    difference: Vec<Vec<f32>>,
-    valid: Vec<Vec<f32>>,
+    /// By row modulo the window: differences, their squares and validity, and first orders.
+    rows: [Vec<Vec<f32>>; 4],
     column: Vec<f32>,
-    sum: Vec<f32>,
-    count: Vec<f32>,
+    /// Sums of the same over 13 x 13 pixels, and of validity and first orders over 5 x 5.
+    sums: [Vec<f32>; 5],
+}
+
+/// What a row's blend looks at; sums are padded rows.
+struct Blend<'a> {
+    first: &'a [f32],
+    second: &'a [f32],
+    sums: [&'a [f32]; 5],
+    /// Standard deviation of e where ZNCC is one below by one.
+    sigma: f32,
+    zncc_min: f32,
 }
 
 impl OrderChoice {
@@ -68,24 +105,22 @@ impl OrderChoice {
                 b.resize(width);
                 let top = band * BAND;
                 let rows = out.len() / width;
-                let side = 2 * RADIUS + 1;
                 for y in top..top + rows + 2 * RADIUS {
                     // Row y - RADIUS enters, row y - 2 RADIUS is finished.
                     let enters = y.checked_sub(RADIUS).filter(|&y| y < height);
-                    b.enter(level, enters.map(|y| (first_px.row(y), second_px.row(y))), y % side);
+                    b.enter(level, enters.map(|y| (first_px.row(y), second_px.row(y))), y);
                     if let Some(row) = (y - top).checked_sub(2 * RADIUS) {
                         let at = row * width..(row + 1) * width;
-                        let y = top + row;
-                        let estimates = (first_px.row(y), second_px.row(y));
-                        let limits = (FLAT * sigma, CURVED * sigma, zncc_min);
-                        b.finish(level, estimates, limits, &mut zncc[at.clone()], &mut out[at]);
+                        let estimates = (first_px.row(top + row), second_px.row(top + row));
+                        let (zncc, out) = (&mut zncc[at.clone()], &mut out[at]);
+                        b.finish(level, y - RADIUS, estimates, (sigma, zncc_min), zncc, out);
                     }
                 }
             });
     }
 
-    /// Standard deviation of the difference, robustly: from the median change over a window's width,
-    /// in which curvature cancels.
+    /// Standard deviation of e where ZNCC is one below by one, robustly: from the median change over a
+    /// window's width, in which curvature cancels.
     fn sigma(&mut self, maps: &DenseMaps) -> f32 {
         let apart = 2 * RADIUS + 1;
         let (first, second) = (maps.first_px.as_slice(), maps.second_px.as_slice());
@@ -95,79 +130,82 @@ impl OrderChoice {
         let changes = pairs.map(|i| (difference(i) - difference(i + apart)).abs());
         let half = std::f32::consts::FRAC_1_SQRT_2;
         self.sample.extend(changes.filter(|d| !d.is_nan()).map(|d| d * half));
-        if self.sample.is_empty() {
-            return SIGMA_PX[0];
-        }
-        let middle = self.sample.len() / 2;
-        let (_, median, _) = self.sample.select_nth_unstable_by(middle, f32::total_cmp);
-        (*median / 0.6745).clamp(SIGMA_PX[0], SIGMA_PX[1])
+        let change = median(&mut self.sample).unwrap_or(0.0);
+        let sigma = (change / 0.6745).clamp(SIGMA_PX.0, SIGMA_PX.1);
+        self.sample.clear();
+        let losses = maps.zncc.as_slice().iter().step_by(97).filter(|z| !z.is_nan());
+        self.sample.extend(losses.map(|z| (1.0 - z).max(LOSS_MIN)));
+        let loss = median(&mut self.sample).unwrap_or(1.0);
+        sigma / loss.sqrt()
     }
+}
+
+/// The middle value.
+fn median(values: &mut [f32]) -> Option<f32> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
 impl Buffers {
     fn resize(&mut self, width: usize) {
         let padded = width.next_multiple_of(WIDEST) + 2 * PAD;
-        let side = 2 * RADIUS + 1;
-        self.difference.resize_with(side, Vec::new);
-        self.valid.resize_with(side, Vec::new);
-        for row in self.difference.iter_mut().chain(&mut self.valid) {
-            row.resize(padded, 0.0);
-            row.fill(0.0);
+        for rows in &mut self.rows {
+            rows.resize_with(SIDE, Vec::new);
         }
-        for row in [&mut self.column, &mut self.sum, &mut self.count] {
+        let rows = self.rows.iter_mut().flatten();
+        for row in rows.chain([&mut self.column]).chain(&mut self.sums) {
             row.resize(padded, 0.0);
             row.fill(0.0);
         }
     }
 
-    fn enter(&mut self, level: Level, rows: Option<(&[f32], &[f32])>, slot: usize) {
-        let (difference, valid) = (&mut self.difference[slot], &mut self.valid[slot]);
-        match rows {
-            None => {
-                difference.fill(0.0);
-                valid.fill(0.0);
+    /// Takes in the row that is step `y` of a band: estimates of both orders, or beyond the image none.
+    fn enter(&mut self, level: Level, estimates: Option<(&[f32], &[f32])>, y: usize) {
+        let rows = self.rows.each_mut().map(|rows| &mut rows[y % SIDE][..]);
+        let Some((first, second)) = estimates else {
+            for row in rows {
+                row.fill(0.0);
             }
-            Some((first, second)) => {
-                let (difference, valid) = (&mut difference[PAD..], &mut valid[PAD..]);
-                vectorised!(
-                    level,
-                    difference_loop(
-                        first: &[f32] = first,
-                        second: &[f32] = second,
-                        difference: &mut [f32] = difference,
-                        valid: &mut [f32] = valid,
-                    )
-                );
-            }
-        }
+            return;
+        };
+        let rows = rows.map(|row| &mut row[PAD..PAD + first.len()]);
+        vectorised!(
+            level,
+            enter_loop(
+                first: &[f32] = first,
+                second: &[f32] = second,
+                rows: [&mut [f32]; 4] = rows,
+            )
+        );
     }
 
+    /// The row that entered at step `y`, with the rows around it.
     fn finish(
         &mut self,
         level: Level,
-        estimates: (&[f32], &[f32]),
-        limits: (f32, f32, f32),
+        y: usize,
+        (first, second): (&[f32], &[f32]),
+        (sigma, zncc_min): (f32, f32),
         zncc: &mut [f32],
         out: &mut [f32],
     ) {
-        const SIDE: usize = 2 * RADIUS + 1;
         let len = out.len().next_multiple_of(WIDEST);
-        let mut rows: [&[f32]; SIDE] = [&[]; SIDE];
-        for (row, d) in rows.iter_mut().zip(&self.difference) {
-            *row = d;
+        // Differences, squares and validity widely; validity and first orders narrowly.
+        let sums = [(0, RADIUS), (1, RADIUS), (2, RADIUS), (2, WIDE), (3, WIDE)];
+        for ((k, radius), sum) in sums.into_iter().zip(&mut self.sums) {
+            // Rows in the order of the image: sums round the same in every band.
+            let around: [&[f32]; SIDE] = std::array::from_fn(|j| {
+                let row = y + j.min(2 * radius) + SIDE - radius;
+                &self.rows[k][row % SIDE][..]
+            });
+            box_sum(level, &around[..2 * radius + 1], radius, len, &mut self.column, sum);
         }
-        box_sum(level, &rows, RADIUS, len, &mut self.column, &mut self.sum);
-        for (row, v) in rows.iter_mut().zip(&self.valid) {
-            *row = v;
-        }
-        box_sum(level, &rows, RADIUS, len, &mut self.column, &mut self.count);
-        let (sum, count) = (&self.sum[PAD..], &self.count[PAD..]);
+        let sums = self.sums.each_ref().map(|sum| &sum[PAD..PAD + out.len()]);
+        let blend = Blend { first, second, sums, sigma, zncc_min };
         vectorised!(
             level,
             blend_loop(
-                estimates: (&[f32], &[f32]) = estimates,
-                smoothed: (&[f32], &[f32]) = (sum, count),
-                limits: (f32, f32, f32) = limits,
+                blend: &Blend<'_> = &blend,
                 zncc: &mut [f32] = zncc,
                 out: &mut [f32] = out,
             )
@@ -176,35 +214,57 @@ impl Buffers {
 }
 
 #[inline(always)]
-fn difference_loop(first: &[f32], second: &[f32], difference: &mut [f32], valid: &mut [f32]) {
-    // Differences of a pixel or more are no matter of order.
-    for (((&a, &b), d), v) in first.iter().zip(second).zip(difference).zip(valid) {
-        let difference = b - a;
-        let good = difference.abs() < 1.0;
-        *d = if good { difference } else { 0.0 };
-        *v = if good { 1.0 } else { 0.0 };
+fn enter_loop(first: &[f32], second: &[f32], rows: [&mut [f32]; 4]) {
+    let [difference, square, valid, kept] = rows;
+    let n = first.len();
+    let (second, difference, square) = (&second[..n], &mut difference[..n], &mut square[..n]);
+    let (valid, kept) = (&mut valid[..n], &mut kept[..n]);
+    for i in 0..n {
+        let e = second[i] - first[i];
+        // Differences of a pixel or more are no matter of order.
+        let good = e.abs() < 1.0;
+        let e = if good { e } else { 0.0 };
+        difference[i] = e;
+        square[i] = e * e;
+        valid[i] = if good { 1.0 } else { 0.0 };
+        kept[i] = if good { first[i] } else { 0.0 };
     }
 }
 
+/// 0 up to the lower bound, 1 from the upper one.
 #[inline(always)]
-fn blend_loop(
-    (first, second): (&[f32], &[f32]),
-    (sum, count): (&[f32], &[f32]),
-    (flat, curved, zncc_min): (f32, f32, f32),
-    zncc: &mut [f32],
-    out: &mut [f32],
-) {
-    let scale = 1.0 / (curved - flat);
-    let estimates = first.iter().zip(second).zip(sum.iter().zip(count));
-    for (((&a, &b), (&sum, &count)), (z, out)) in estimates.zip(zncc.iter_mut().zip(out)) {
-        let mean = (sum / count.max(1.0)).abs();
-        let part = ((mean - flat) * scale).clamp(0.0, 1.0);
+fn ramp(value: f32, (low, high): (f32, f32)) -> f32 {
+    ((value - low) * (1.0 / (high - low))).clamp(0.0, 1.0)
+}
+
+#[inline(always)]
+fn blend_loop(blend: &Blend<'_>, zncc: &mut [f32], out: &mut [f32]) {
+    let n = out.len();
+    let (first, second) = (&blend.first[..n], &blend.second[..n]);
+    let [sum, squares, count, near, kept] = blend.sums.map(|sum| &sum[..n]);
+    let zncc = &mut zncc[..n];
+    let all_near = ((2 * WIDE + 1) * (2 * WIDE + 1)) as f32;
+    for i in 0..n {
+        let (a, b, z) = (first[i], second[i], zncc[i]);
+        let sigma = blend.sigma * (1.0 - z).max(LOSS_MIN).sqrt();
+        let per_sigma = 1.0 / sigma;
+        let per = 1.0 / count[i].max(1.0);
+        let mean = sum[i] * per;
+        let variance = (squares[i] * per - mean * mean) * per_sigma * per_sigma;
+        let bias = mean * ramp(mean.abs() * per_sigma, BIAS);
+        let calm = a + bias;
+        let wide = kept[i] * (1.0 / all_near) + (1.0 + WIDE_BIAS) * bias;
+        let change = wide - calm;
+        let part = 1.0 - ramp(change.abs() * per_sigma, SHAPE);
+        let calm = if near[i] > all_near - 0.5 { calm + part * change } else { calm };
+        let whole = calm + ramp(variance, ROUGH) * (b - calm);
+        let edge = a + ramp(mean.abs() * per_sigma, EDGE) * (b - a);
+        let both = if count[i] >= WHOLE { whole } else { edge };
         // Where only the first order could be fitted it has to do.
-        let both = a + part * (b - a);
         let d = if b.is_nan() { a } else { both };
-        let good = *z >= zncc_min && !d.is_nan();
-        *out = if good { d } else { f32::NAN };
-        *z = if good { *z } else { f32::NAN };
+        let good = z >= blend.zncc_min && !d.is_nan();
+        out[i] = if good { d } else { f32::NAN };
+        zncc[i] = if good { z } else { f32::NAN };
     }
 }
 

@@ -71,7 +71,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         }
         let stats = stream.stats();
         let report = frame_report::of(&args.source.uri, &frame, stream.matching(), &stats);
-        outputs::write(&mut out, &frame, &report, &mut |_| {})
+        outputs::write(&mut out, &frame, &report, outputs::Extras::default(), &mut |_| {})
             .and_then(|()| interrupt::check().map_or(Ok(()), |()| out.commit()))
             .map_err(|e| output_failure(&e))?;
         interrupt::check()?;

@@ -80,8 +80,10 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
 
     let mut report = frame_report::of(&source.uri, &frame, &matching, &stream.stats());
     report["truth"] = json!({ "score": scored, "fits": fits });
-    outputs::write(&mut out, &frame, &report, &mut |file| progress.set_message(file))
-        .map_err(|e| output_failure(&e))?;
+    outputs::write(&mut out, &frame, &report, outputs::Extras::default(), &mut |file| {
+        progress.set_message(file)
+    })
+    .map_err(|e| output_failure(&e))?;
     drop(stream);
     interrupt::check()?;
     out.commit().map_err(|e| output_failure(&e))?;

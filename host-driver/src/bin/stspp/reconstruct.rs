@@ -33,6 +33,10 @@ pub struct Args {
     /// First pair to use.
     #[arg(long, default_value_t = 0)]
     first: usize,
+    /// Also write the speed along depth: depth_rate.tiff (m/s), and depth_rate of each point. Method
+    /// dense, and a frames.json with times.
+    #[arg(long)]
+    depth_rate: bool,
 }
 
 /// How frames are matched; shared by the verbs that match.
@@ -144,8 +148,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     interrupt::check()?;
     let source = args.folder.display().to_string();
     let report = report::of_reconstruction(&source, &result);
-    outputs::write(&mut out, &result.frame, &report, &mut |file| progress.set_message(file))
-        .map_err(|e| output_failure(&e))?;
+    let extras = outputs::Extras { depth_rate: args.depth_rate };
+    outputs::write(&mut out, &result.frame, &report, extras, &mut |file| {
+        progress.set_message(file)
+    })
+    .map_err(|e| output_failure(&e))?;
     interrupt::check()?;
     out.commit().map_err(|e| output_failure(&e))?;
     progress.finish_and_clear();

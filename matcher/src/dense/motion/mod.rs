@@ -26,7 +26,7 @@ mod rates;
 mod sums;
 
 use super::{DenseFit, DenseMaps, warp::moving};
-use crate::{Image, Level, StereoStack};
+use crate::{Image, Level, ShapeFunction, StereoStack};
 use rates::Rates;
 use sums::{Blocks, Frame};
 
@@ -116,6 +116,31 @@ impl Motion {
     }
 }
 
+/// What the sums of a frame have in common.
+struct Maker<'a> {
+    level: Level,
+    stack: &'a StereoStack<'a>,
+    step: &'a Image<u8>,
+    times: &'a Times,
+}
+
+impl<'a> Maker<'a> {
+    /// Sums at the disparities of a fit that took the scene for still with windows of radius `smeared`,
+    /// or that knew how it moves.
+    fn of<'b>(
+        &'b self,
+        disparity_px: &'b Image<f32>,
+        zncc: &'b Image<f32>,
+        smeared: Option<usize>,
+    ) -> Frame<'b>
+    where
+        'a: 'b,
+    {
+        let Self { level, stack, step, times } = *self;
+        Frame { level, stack, step, times, disparity_px, zncc, smeared }
+    }
+}
+
 /// Estimates motion; keeps its buffers between frames.
 #[derive(Debug)]
 pub struct MotionFit {
@@ -159,9 +184,11 @@ impl MotionFit {
         }
         self.motion.frames = times.frames;
         self.motion.offsets = std::array::from_fn(|k| times.centred[k] * times.unit);
-        let smeared = Some(fit.radius);
-        let frame = |maps| Frame { level: self.level, stack, step, times: &times, maps, smeared };
-        self.blocks.sum(&frame(maps), None);
+        let frame = Maker { level: self.level, stack, step, times: &times };
+        // The first order's bias on curved surfaces would look like motion.
+        let both = fit.shape != ShapeFunction::First;
+        let best = if both { &maps.second_px } else { &maps.first_px };
+        self.blocks.sum(&frame.of(best, &maps.zncc, None), None);
         self.rates.begin();
         self.rates.add(&self.blocks, &times);
         if !self.rates.any() {
@@ -169,7 +196,8 @@ impl MotionFit {
         }
         for _ in 0..ROUNDS {
             self.rates.expand(&self.blocks, &maps.first_px, &mut self.motion.rate);
-            self.blocks.sum(&frame(maps), Some(&self.motion));
+            let smeared = Some(fit.radius);
+            self.blocks.sum(&frame.of(&maps.first_px, &maps.zncc, smeared), Some(&self.motion));
             self.rates.add(&self.blocks, &times);
         }
         self.rates.expand(&self.blocks, &maps.first_px, &mut self.motion.rate);
@@ -177,8 +205,8 @@ impl MotionFit {
         self.begin(start, maps, &times);
         fit.refit(stack, &self.start, step, &self.motion, &self.rates.moving(), maps);
 
-        let frame = Frame { level: self.level, stack, step, times: &times, maps, smeared: None };
-        self.blocks.sum(&frame, Some(&self.motion));
+        let best = if both { &maps.second_px } else { &maps.first_px };
+        self.blocks.sum(&frame.of(best, &maps.zncc, None), Some(&self.motion));
         self.rates.add(&self.blocks, &times);
         // The fit stands for the frames' mean, whatever rate it was made with.
         let mut last = Image::new(width, height, 0.0);

@@ -14,6 +14,10 @@ const ALIKE: f32 = 4.0;
 const ALIKE_PART: f32 = 0.1;
 /// Fewest blocks of a plane; fewer give their mean.
 const PLANE_MIN: usize = 9;
+/// Fewest blocks that move alike, and their least part by weight of those around: a block that moves
+/// like no other has seen wrong pixels, not motion.
+const ALIKE_MIN: usize = 4;
+const ALIKE_WEIGHT: f64 = 0.15;
 /// Rates of fewer standard deviations are noise...
 const NOISE: f32 = 4.5;
 /// ...of more are motion; in between they count in part.
@@ -195,16 +199,19 @@ fn plane(
     }
     let floor = f32::MIN_POSITIVE.max(noise);
     let (mut m, mut v, mut count) = ([[0.0f64; 3]; 3], [0.0f64; 3], 0);
+    let (mut squares, mut all) = (0.0, 0.0);
     for (c, r) in neighbours((column, row), (columns, rows), REACH) {
         let (other, w) = own[r * columns + c];
         if w <= 0.0 {
             continue;
         }
+        all += f64::from(w);
         let limit = ALIKE * (floor * (1.0 / weight + 1.0 / w)).sqrt() + ALIKE_PART * rate.abs();
         if (other - rate).abs() > limit {
             continue;
         }
         count += 1;
+        squares += f64::from(w) * f64::from(other).powi(2);
         let phi = [1.0, c as f64 - column as f64, r as f64 - row as f64];
         for (i, a) in phi.iter().enumerate() {
             v[i] += f64::from(w) * a * f64::from(other);
@@ -213,9 +220,18 @@ fn plane(
             }
         }
     }
+    if count < ALIKE_MIN || m[0][0] < ALIKE_WEIGHT * all {
+        return Around::default();
+    }
     let mean = v[0] / m[0][0];
     let noise = f64::from(floor);
-    let (mut rate, mut slope, mut variance) = (mean, [0.0; 2], noise / m[0][0]);
+    // Blocks that scatter by more than noise, as where the disparity itself is biased, are less certain.
+    let spread = |explained: f64, unknowns: usize| {
+        let chi_squared = (squares - explained) / noise;
+        noise * (chi_squared / (count - unknowns) as f64).max(1.0)
+    };
+    let mut variance = spread(mean * v[0], 1) / m[0][0];
+    let (mut rate, mut slope) = (mean, [0.0; 2]);
     if count >= PLANE_MIN {
         let inverse = nalgebra::Matrix3::from_fn(|i, j| m[i][j]).try_inverse();
         // At the image's corners a plane's value is far less certain than the mean.
@@ -223,6 +239,7 @@ fn plane(
             let found = inverse * nalgebra::Vector3::from(v);
             let gradient = [found[1], found[2]];
             // Gradients within their noise are none.
+            let noise = spread(found.dot(&nalgebra::Vector3::from(v)), 3);
             let sure = (1..3).any(|k| found[k].powi(2) > 9.0 * noise * inverse[(k, k)]);
             if sure {
                 (rate, slope, variance) = (found[0], gradient, noise * inverse[(0, 0)]);

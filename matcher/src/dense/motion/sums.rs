@@ -8,7 +8,6 @@ use super::{BLOCK, Motion, Times, lag::Lag};
 use crate::{
     Image, Level, StereoStack,
     dense::{
-        DenseMaps,
         gradient::{SQUARE_UNIT, Static, static_row},
         tile::image_rows,
         warp::{Source, Warped, moving, warp_row},
@@ -36,7 +35,9 @@ pub(crate) struct Frame<'a> {
     pub stack: &'a StereoStack<'a>,
     pub step: &'a Image<u8>,
     pub times: &'a Times,
-    pub maps: &'a DenseMaps,
+    /// Disparities that the sums are made at.
+    pub disparity_px: &'a Image<f32>,
+    pub zncc: &'a Image<f32>,
     /// Radius of the windows that the disparities were fitted in as if nothing moved, if they were.
     pub smeared: Option<usize>,
 }
@@ -82,7 +83,7 @@ struct Scratch {
 const TERMS: usize = 14;
 
 impl Blocks {
-    /// Sums the fit in `frame.maps`, whose frames lie where `motion` says. Without motion, all lie at the
+    /// Sums the fit in `frame`, whose frames lie where `motion` says. Without motion, all lie at the
     /// same place.
     pub fn sum(&mut self, frame: &Frame<'_>, motion: Option<&Motion>) {
         let (width, height) = (frame.stack.width(), frame.stack.height());
@@ -159,7 +160,7 @@ impl Scratch {
     /// The disparities of row `y` that take part, NaN elsewhere.
     fn select(&mut self, frame: &Frame<'_>, y: usize, surfaces: &[(f32, f32)]) {
         self.w.fill(f32::NAN);
-        let rows = frame.maps.first_px.row(y).iter().zip(frame.maps.zncc.row(y));
+        let rows = frame.disparity_px.row(y).iter().zip(frame.zncc.row(y));
         let rows = rows.zip(frame.step.row(y));
         for (x, (to, ((&d, &zncc), &step))) in self.w.iter_mut().zip(rows).enumerate() {
             let (low, high) = surfaces[x / BLOCK];
@@ -223,7 +224,7 @@ fn surfaces(
     blocks: usize,
 ) -> Vec<(f32, f32)> {
     let mut bounds = vec![(f32::INFINITY, f32::NEG_INFINITY); blocks];
-    let rows: Vec<&[f32]> = rows.map(|y| frame.maps.first_px.row(y)).collect();
+    let rows: Vec<&[f32]> = rows.map(|y| frame.disparity_px.row(y)).collect();
     for row in &rows {
         for (pixels, (low, high)) in row.chunks(BLOCK).zip(&mut bounds) {
             for &d in pixels {
