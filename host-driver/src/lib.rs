@@ -16,6 +16,7 @@
 
 #[cfg(feature = "sim")]
 pub mod accuracy;
+pub mod calibrate;
 pub mod calibration;
 pub mod cpu_time;
 pub mod export;

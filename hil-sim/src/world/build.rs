@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use nalgebra::{Isometry3, Vector3};
 
+use super::board::BoardTexture;
 use super::error::WorldError;
 use super::geometry::isometry;
 use super::material::{Gloss, Material, Texture};
@@ -66,12 +67,14 @@ pub(crate) fn build(spec: &SceneSpec, left_from_rig: &Isometry3<f64>) -> Result<
         SceneKind::Panel => vec![still("panel", panel::panel(), pose, material)],
         SceneKind::Wires => wires(left_from_rig, spec.distance_m, &material),
         SceneKind::Board { texture, rig_from_board } => {
-            let pose = rig_from_board.map_or(pose, |board| left_from_rig * board);
-            // A white margin around the print, as on a real board.
-            let half_size_m = texture.size_m().map(|s| s / 2.0 + BOARD_MARGIN_M);
-            let print =
-                Material { texture: Texture::Board(Box::new(texture.clone())), gloss: None };
-            vec![still("board", Rectangle { half_size_m }, pose, print)]
+            vec![board(texture, rig_from_board.map_or(pose, |board| left_from_rig * board))]
+        }
+        SceneKind::BoardTour { texture, rig_from_board, dwell_s } => {
+            let poses: Vec<_> = rig_from_board.iter().map(|board| left_from_rig * board).collect();
+            let first = poses.first().copied().unwrap_or(pose);
+            let displacements = poses.iter().map(|pose| pose * first.inverse()).collect();
+            let motion = Motion::Steps { displacements, dwell_s: *dwell_s };
+            vec![Object { motion, ..board(texture, first) }]
         }
         SceneKind::Mesh { path, scale, is_z_up } => {
             let mesh = Arc::new(mesh_file::load(path, *scale)?);
@@ -81,6 +84,13 @@ pub(crate) fn build(spec: &SceneSpec, left_from_rig: &Isometry3<f64>) -> Result<
         }
     };
     Ok(Scene { objects })
+}
+
+/// A printed target with a white margin around the print, as on a real board.
+fn board(texture: &BoardTexture, left_from_board: Isometry3<f64>) -> Object {
+    let half_size_m = texture.size_m().map(|s| s / 2.0 + BOARD_MARGIN_M);
+    let print = Material { texture: Texture::Board(Box::new(texture.clone())), gloss: None };
+    still("board", Rectangle { half_size_m }, left_from_board, print)
 }
 
 /// Rods and strips around `distance_m`, in front of a plane 0.25 m behind.

@@ -216,7 +216,9 @@ impl CameraUnit {
         let directions = known.unwrap_or_else(|| Arc::new(view.directions()));
         let mut refinement = Refinement::Sharp;
         if !scene.is_still() {
-            refinement = Refinement::Coarse;
+            if scene.speed_m_per_s() > 0.0 {
+                refinement = Refinement::Coarse;
+            }
             // Every frame needs them again.
             self.lock().directions.get_or_insert_with(|| Arc::clone(&directions));
         }

@@ -1,5 +1,7 @@
 //! Objects, where they are at a time, and which of them a ray meets.
 
+use std::sync::Arc;
+
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
 use super::geometry::{Hit, Ray, Rigid, transform_point};
@@ -7,7 +9,7 @@ use super::material::Material;
 use super::shapes::Shape;
 
 /// How an object moves. Times are virtual time.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Motion {
     Still,
     /// Constant velocity, in the left camera's frame.
@@ -19,6 +21,12 @@ pub(crate) enum Motion {
         through: Vector3<f64>,
         axis: Unit<Vector3<f64>>,
         rad_per_s: f64,
+    },
+    /// Moved by these from its place at time 0, each for `dwell_s`, then from the first again: held
+    /// still, as by a hand that brings it from view to view.
+    Steps {
+        displacements: Arc<[Isometry3<f64>]>,
+        dwell_s: f64,
     },
 }
 
@@ -35,13 +43,23 @@ impl Motion {
                 let rotation = UnitQuaternion::from_axis_angle(axis, rad_per_s * seconds);
                 Isometry3::from_parts((through - rotation * through).into(), rotation)
             }
+            Self::Steps { displacements, dwell_s } => {
+                // A hair is added so that a multiple of the dwell is in the step that it begins.
+                let step = (seconds / dwell_s + 1e-9) as usize;
+                displacements.get(step % displacements.len().max(1)).copied().unwrap_or_default()
+            }
         }
+    }
+
+    /// Whether every time shows the same.
+    pub fn is_still(&self) -> bool {
+        matches!(self, Self::Still)
     }
 
     /// Speed of a point in metres per second.
     fn speed_m_per_s(&self, point: &Vector3<f64>) -> f64 {
         match self {
-            Self::Still => 0.0,
+            Self::Still | Self::Steps { .. } => 0.0,
             Self::Linear { velocity_m_per_s } => velocity_m_per_s.norm(),
             Self::Turning { through, axis, rad_per_s } => {
                 (point - through).cross(axis).norm() * rad_per_s.abs()
@@ -69,7 +87,7 @@ pub(crate) struct Scene {
 
 impl Scene {
     pub fn is_still(&self) -> bool {
-        self.objects.iter().all(|o| o.motion == Motion::Still)
+        self.objects.iter().all(|o| o.motion.is_still())
     }
 
     /// The fastest point's speed, about.

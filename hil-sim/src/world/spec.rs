@@ -228,6 +228,7 @@ pub(crate) enum SceneKind {
     Panel,
     Wires,
     Board { texture: BoardTexture, rig_from_board: Option<Isometry3<f64>> },
+    BoardTour { texture: BoardTexture, rig_from_board: Vec<Isometry3<f64>>, dwell_s: f64 },
     Mesh { path: PathBuf, scale: f64, is_z_up: bool },
 }
 
@@ -315,9 +316,32 @@ impl SceneSpec {
     /// the sensor upright has the identity rotation: its x is to the right, its y down.
     #[must_use]
     pub fn board(texture: BoardTexture, rig_from_board: Isometry3<f64>) -> Self {
+        Self::of_board(
+            SceneKind::Board { texture, rig_from_board: Some(rig_from_board) },
+            rig_from_board.translation.z,
+        )
+    }
+
+    /// A printed target that is held still at each of these poses in turn for `dwell_s`, then from
+    /// the first again.
+    ///
+    /// # Panics
+    /// Without a pose, or when `dwell_s` is not positive.
+    #[must_use]
+    pub fn board_tour(
+        texture: BoardTexture,
+        rig_from_board: Vec<Isometry3<f64>>,
+        dwell_s: f64,
+    ) -> Self {
+        assert!(!rig_from_board.is_empty() && dwell_s > 0.0, "a tour has poses and takes time");
+        let distance_m = rig_from_board[0].translation.z;
+        Self::of_board(SceneKind::BoardTour { texture, rig_from_board, dwell_s }, distance_m)
+    }
+
+    fn of_board(kind: SceneKind, distance_m: f64) -> Self {
         Self {
-            kind: SceneKind::Board { texture, rig_from_board: Some(rig_from_board) },
-            distance_m: rig_from_board.translation.z,
+            kind,
+            distance_m,
             tilt_deg: 0.0,
             turn_deg: 0.0,
             roll_deg: 0.0,

@@ -1,6 +1,6 @@
 //! One camera: pinhole projection with Brown's radial-tangential distortion.
 
-use nalgebra::{Matrix2, Point3, Vector2};
+use nalgebra::{Matrix2, Matrix2x3, Point3, SMatrix, Vector2};
 
 use super::error::FieldError;
 
@@ -22,7 +22,69 @@ pub struct CameraIntrinsics {
     pub resolution_px: [usize; 2],
 }
 
+/// A pixel and how it moves, see [`CameraIntrinsics::project_with_derivatives`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Projection {
+    /// The pixel.
+    pub pixel: Vector2<f64>,
+    /// Its derivative by the point, in px per metre.
+    pub by_point: Matrix2x3<f64>,
+    /// Its derivative by [fu, fv, pu, pv, k1, k2, p1, p2].
+    pub by_intrinsics: SMatrix<f64, 2, 8>,
+}
+
 impl CameraIntrinsics {
+    /// The intrinsics as [fu, fv, pu, pv, k1, k2, p1, p2].
+    pub fn to_vector(&self) -> [f64; 8] {
+        let ([fu, fv], [pu, pv], [k1, k2, p1, p2]) =
+            (self.focal_px, self.principal_px, self.radtan);
+        [fu, fv, pu, pv, k1, k2, p1, p2]
+    }
+
+    /// Intrinsics from [fu, fv, pu, pv, k1, k2, p1, p2].
+    pub fn from_vector(values: [f64; 8], resolution_px: [usize; 2]) -> Self {
+        let [fu, fv, pu, pv, k1, k2, p1, p2] = values;
+        Self {
+            focal_px: [fu, fv],
+            principal_px: [pu, pv],
+            radtan: [k1, k2, p1, p2],
+            resolution_px,
+        }
+    }
+
+    /// [`Self::project`] with the derivatives by the point and by the intrinsics.
+    pub fn project_with_derivatives(&self, point_camera: &Point3<f64>) -> Option<Projection> {
+        let z = point_camera.z;
+        if z.is_nan() || z <= 0.0 {
+            return None;
+        }
+        let n = point_camera.coords.xy() / z;
+        let (d, d_by_n) = self.distort_with_jacobian(n);
+        let focal = Matrix2::new(self.focal_px[0], 0.0, 0.0, self.focal_px[1]);
+        let n_by_point =
+            Matrix2x3::new(1.0 / z, 0.0, -n.x / z, 0.0, 1.0 / z, -n.y / z);
+        let r2 = n.norm_squared();
+        let mut by_intrinsics = SMatrix::<f64, 2, 8>::zeros();
+        let coefficients = [
+            n * r2,
+            n * r2 * r2,
+            Vector2::new(2.0 * n.x * n.y, r2 + 2.0 * n.y * n.y),
+            Vector2::new(r2 + 2.0 * n.x * n.x, 2.0 * n.x * n.y),
+        ];
+        for row in 0..2 {
+            by_intrinsics[(row, row)] = d[row];
+            by_intrinsics[(row, 2 + row)] = 1.0;
+            for (k, by_coefficient) in coefficients.iter().enumerate() {
+                by_intrinsics[(row, 4 + k)] = self.focal_px[row] * by_coefficient[row];
+            }
+        }
+        Some(Projection {
+            pixel: self.pixel_of_distorted(d),
+            by_point: focal * d_by_n * n_by_point,
+            by_intrinsics,
+        })
+    }
+
     /// Distorts normalised coordinates (x / z, y / z): where the lens images them.
     pub fn distort(&self, undistorted: Vector2<f64>) -> Vector2<f64> {
         self.distort_with_jacobian(undistorted).0

@@ -4,6 +4,7 @@
 //! and pairs of ROS camera_info files ([`ros`]) are imported.
 
 mod camera;
+mod epipolar;
 mod error;
 pub mod kalibr;
 pub mod opencv;
@@ -14,7 +15,8 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-pub use camera::CameraIntrinsics;
+pub use camera::{CameraIntrinsics, Projection};
+pub use epipolar::essential;
 pub use error::{CalibrationError, FieldError};
 
 /// Largest entry of R^T R - 1 that still counts as rounding of a printed rotation.
