@@ -6,10 +6,13 @@
 
 pub mod board;
 pub mod bundle;
+pub mod detect;
 pub mod dictionary;
 pub mod eccentricity;
 pub mod homography;
 pub mod observations;
+#[cfg(feature = "sim")]
+pub mod rendered;
 pub mod solve;
 pub mod tour;
 pub mod zhang;

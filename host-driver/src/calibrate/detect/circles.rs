@@ -1,0 +1,267 @@
+//! Boards of discs: dark spots, their outlines as ellipses, their grid, and the three hollow ones that
+//! tell where the board begins.
+
+use nalgebra::Vector2;
+use rayon::prelude::*;
+use stspp_matcher::Image;
+
+use super::gray::Gray;
+use super::lattice::{self, Cell, Lattice, Nearby};
+use super::refine::{self, Ellipse, Refined};
+use super::{Detection, Problem, Quality};
+use crate::calibrate::Board;
+use crate::calibrate::observations::Sighting;
+
+/// Side of the window whose mean the spots are darker than, as a part of the image's width.
+const WINDOW: f64 = 1.0 / 14.0;
+/// How much darker than their surroundings, in grey values of 8 bits, at least.
+const DARKER: f32 = 5.0;
+/// Least and largest area of a spot in px.
+const AREA_PX: std::ops::Range<usize> = 24..20_000;
+/// Largest ratio of a spot's axes: a tilt of 70 degrees.
+const ELONGATION_MAX: f64 = 3.0;
+/// Seeds from which a grid is grown.
+const SEEDS: usize = 16;
+
+/// A dark spot.
+struct Spot {
+    ellipse: Ellipse,
+    /// Grey value in the middle and of the dark part.
+    is_hollow: bool,
+    dark: f64,
+    light: f64,
+}
+
+/// Finds a board of discs in an image.
+pub fn detect(gray: &Gray, board: &Board) -> Result<Detection, Problem> {
+    let spots = spots(gray);
+    let points: Vec<Vector2<f64>> = spots.iter().map(|spot| spot.ellipse.centre).collect();
+    let nearby = Nearby::new(&points);
+    let mut best = Lattice::new();
+    let mut seeds = 0;
+    // From the middle of all spots outwards: the board is where the spots are.
+    let middle = points.iter().sum::<Vector2<f64>>() / points.len().max(1) as f64;
+    let mut order: Vec<usize> = (0..points.len()).collect();
+    order.sort_by(|&a, &b| (points[a] - middle).norm().total_cmp(&(points[b] - middle).norm()));
+    let mut tried = vec![false; points.len()];
+    for &seed in &order {
+        if tried[seed] || seeds == SEEDS {
+            continue;
+        }
+        let Some(along) = seed_vectors(&points, seed) else { continue };
+        seeds += 1;
+        let size = |index: usize| spots[index].ellipse.shape[0] + spots[index].ellipse.shape[2];
+        let lattice = lattice::grow(&points, &nearby, seed, along, |index, _| {
+            (0.4..2.5).contains(&(size(index) / size(seed)))
+        });
+        lattice.values().for_each(|&index| tried[index] = true);
+        if lattice.len() > best.len() {
+            best = lattice;
+        }
+    }
+    if best.len() < 6 {
+        return Err(Problem::NoBoard { corners: points.len() });
+    }
+    let index_of = placed(&spots, &best, board)?;
+    let inside: Vec<(usize, usize)> =
+        best.iter().filter_map(|(cell, spot)| Some((index_of(*cell)?, *spot))).collect();
+    let strays = best.len() - inside.len();
+    if strays > inside.len() / 4 {
+        return Err(Problem::OtherBoard { markers: strays });
+    }
+    let refined: Vec<(usize, Refined)> = inside
+        .par_iter()
+        .filter_map(|&(point, spot)| {
+            let Spot { ellipse, dark, light, .. } = spots[spot];
+            Some((point, refine::disc(gray, ellipse, light, dark)?))
+        })
+        .collect();
+    let mut quality = Quality::of(refined.iter().map(|(_, r)| r));
+    quality.strays = strays;
+    let sightings =
+        refined.into_iter().map(|(point, r)| Sighting { point, pixel: r.pixel }).collect();
+    Ok(Detection { sightings, quality })
+}
+
+/// Mean grey value of a window about each pixel, by an integral image.
+fn local_mean(gray: &Gray) -> Image<f32> {
+    let (w, h) = (gray.width(), gray.height());
+    let reach = ((w as f64 * WINDOW) as usize / 2).max(4);
+    let mut sums = vec![0.0_f64; (w + 1) * (h + 1)];
+    for y in 0..h {
+        let mut line = 0.0;
+        for (x, value) in gray.pixels.row(y).iter().enumerate() {
+            line += f64::from(*value);
+            sums[(y + 1) * (w + 1) + x + 1] = sums[y * (w + 1) + x + 1] + line;
+        }
+    }
+    let mut mean = Image::new(w, h, 0.0_f32);
+    for y in 0..h {
+        let (top, bottom) = (y.saturating_sub(reach), (y + reach + 1).min(h));
+        for (x, out) in mean.row_mut(y).iter_mut().enumerate() {
+            let (left, right) = (x.saturating_sub(reach), (x + reach + 1).min(w));
+            let at = |x: usize, y: usize| sums[y * (w + 1) + x];
+            let sum = at(right, bottom) - at(left, bottom) - at(right, top) + at(left, top);
+            *out = (sum / ((right - left) * (bottom - top)) as f64) as f32;
+        }
+    }
+    mean
+}
+
+/// The connected dark spots that look like discs or rings.
+fn spots(gray: &Gray) -> Vec<Spot> {
+    let mean = local_mean(gray);
+    let (w, h) = (gray.width(), gray.height());
+    let is_dark: Vec<bool> = gray
+        .pixels
+        .as_slice()
+        .iter()
+        .zip(mean.as_slice())
+        .map(|(value, mean)| *value < mean - DARKER)
+        .collect();
+    let mut seen = vec![false; w * h];
+    let mut spots = Vec::new();
+    let mut stack = Vec::new();
+    for first in 0..w * h {
+        if !is_dark[first] || seen[first] {
+            continue;
+        }
+        let mut pixels = Vec::new();
+        let mut touches_border = false;
+        stack.push(first);
+        seen[first] = true;
+        while let Some(index) = stack.pop() {
+            pixels.push(index);
+            let (x, y) = (index % w, index / w);
+            if x == 0 || y == 0 || x + 1 == w || y + 1 == h {
+                touches_border = true;
+                continue;
+            }
+            for next in [index - 1, index + 1, index - w, index + w] {
+                if is_dark[next] && !seen[next] {
+                    seen[next] = true;
+                    stack.push(next);
+                }
+            }
+        }
+        if !touches_border && AREA_PX.contains(&pixels.len()) {
+            spots.extend(spot(gray, &pixels));
+        }
+    }
+    spots
+}
+
+/// A spot from its pixels; `None` when it is not the image of a disc or ring.
+fn spot(gray: &Gray, pixels: &[usize]) -> Option<Spot> {
+    let w = gray.width();
+    let n = pixels.len() as f64;
+    let place = |index: usize| Vector2::new((index % w) as f64, (index / w) as f64);
+    let centre = pixels.iter().map(|&i| place(i)).sum::<Vector2<f64>>() / n;
+    let (mut xx, mut xy, mut yy) = (1.0 / 12.0, 0.0, 1.0 / 12.0);
+    for &index in pixels {
+        let d = place(index) - centre;
+        xx += d.x * d.x / n;
+        xy += d.x * d.y / n;
+        yy += d.y * d.y / n;
+    }
+    let (mean, difference) = ((xx + yy) / 2.0, (xx - yy) / 2.0);
+    let spread = difference.hypot(xy);
+    let (largest, least) = (mean + spread, mean - spread);
+    if least <= 0.0 || (largest / least).sqrt() > ELONGATION_MAX {
+        return None;
+    }
+    // A full ellipse of these moments has this area; a ring less, and nothing else much more.
+    let full = 4.0 * std::f64::consts::PI * (largest * least).sqrt();
+    let filled = n / full;
+    let dark = pixels.iter().map(|&i| f64::from(gray.pixels.as_slice()[i])).sum::<f64>() / n;
+    let middle = gray.at(centre);
+    let radius = 2.0 * largest.sqrt();
+    let light = (0..16)
+        .map(|k| {
+            let angle = f64::from(k) / 16.0 * std::f64::consts::TAU;
+            gray.at(centre + Vector2::new(angle.cos(), angle.sin()) * (1.25 * radius + 2.0))
+        })
+        .fold(f64::NEG_INFINITY, f64::max);
+    let is_hollow = middle > dark + 0.3 * (light - dark);
+    // A ring's moments are larger than those of the disc with its outline: by 1 + 0.4^2 for a hole of
+    // 0.4 radii.
+    let (expected, shrink) = if is_hollow { (0.72, 1.16) } else { (1.0, 1.0) };
+    if !(0.75..1.2).contains(&(filled / expected)) {
+        return None;
+    }
+    let shape = [xx, xy, yy].map(|v| 4.0 * v / shrink);
+    Some(Spot { ellipse: Ellipse { centre, shape }, is_hollow, dark, light })
+}
+
+/// Vectors to the neighbours of a spot: of its four nearest, two opposite pairs. Right-handed.
+fn seed_vectors(points: &[Vector2<f64>], seed: usize) -> Option<[Vector2<f64>; 2]> {
+    let mut near: Vec<Vector2<f64>> = (0..points.len())
+        .filter(|&index| index != seed)
+        .map(|index| points[index] - points[seed])
+        .collect();
+    near.sort_by(|a, b| a.norm().total_cmp(&b.norm()));
+    near.truncate(4);
+    let first = *near.first()?;
+    let is_opposite = |a: &Vector2<f64>, b: &Vector2<f64>| (a + b).norm() < 0.3 * a.norm();
+    let opposite = near.iter().position(|v| is_opposite(&first, v))?;
+    let rest: Vec<_> =
+        (1..near.len()).filter(|&k| k != opposite).map(|k| near[k]).collect();
+    let [second, third] = rest[..] else { return None };
+    if !is_opposite(&second, &third) {
+        return None;
+    }
+    Some(if first.perp(&second) > 0.0 { [first, second] } else { [first, -second] })
+}
+
+/// The board's point index of each cell, from the hollow discs.
+fn placed(
+    spots: &[Spot],
+    lattice: &Lattice,
+    board: &Board,
+) -> Result<impl Fn(Cell) -> Option<usize>, Problem> {
+    let hollow: Vec<Cell> = lattice
+        .iter()
+        .filter(|(_, spot)| spots[**spot].is_hollow)
+        .map(|(cell, _)| *cell)
+        .collect();
+    let [a, b, c] = hollow[..] else {
+        return Err(Problem::NoOrigin { hollow: hollow.len() });
+    };
+    let minus = |p: Cell, q: Cell| (p.0 - q.0, p.1 - q.1);
+    let mut found = None;
+    let mut is_mirrored = false;
+    for [corner, long, short] in
+        [[a, b, c], [a, c, b], [b, a, c], [b, c, a], [c, a, b], [c, b, a]]
+    {
+        let (x, y) = (minus(long, corner), minus(short, corner));
+        let is_l = x.0 * y.0 + x.1 * y.1 == 0
+            && x.0.abs() + x.1.abs() == 2
+            && (x.0 == 0 || x.1 == 0)
+            && y.0.abs() + y.1.abs() == 1;
+        if is_l {
+            let (x, y) = ((x.0 / 2, x.1 / 2), y);
+            // The grid's own directions are right-handed, and so are the board's.
+            if x.0 * y.1 - x.1 * y.0 == 1 {
+                found = Some((corner, x, y));
+            } else {
+                is_mirrored = true;
+            }
+        }
+    }
+    let Some((corner, x, y)) = found else {
+        return Err(if is_mirrored {
+            Problem::Mirrored
+        } else {
+            Problem::NoOrigin { hollow: hollow.len() }
+        });
+    };
+    let [(column, row), ..] = board.hollow();
+    let (columns, rows) = (board.columns as i32, board.rows as i32);
+    Ok(move |cell: Cell| {
+        let d = minus(cell, corner);
+        let column = column as i32 + d.0 * x.0 + d.1 * x.1;
+        let row = row as i32 + d.0 * y.0 + d.1 * y.1;
+        let inside = (0..columns).contains(&column) && (0..rows).contains(&row);
+        inside.then(|| (row * columns + column) as usize)
+    })
+}

@@ -1,0 +1,113 @@
+//! Target points of a board in an image.
+
+mod charuco;
+mod circles;
+mod fit;
+mod gray;
+mod lattice;
+mod refine;
+
+use serde::Serialize;
+
+use super::observations::Sighting;
+use super::{Board, Pattern};
+use crate::RawImage;
+use gray::Gray;
+use refine::Refined;
+
+/// Grey value, of 255, at which white counts as cut off.
+const SATURATED: f64 = 252.0;
+
+/// What was found in an image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Detection {
+    /// The points.
+    pub sightings: Vec<Sighting>,
+    /// How good the image is.
+    pub quality: Quality,
+}
+
+/// How good an image of a board is, from the refined points.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Quality {
+    /// Median blur of the edges (standard deviation), in px.
+    pub blur_px: f64,
+    /// Median grey value of white next to the points, 255 is full scale.
+    pub white: f64,
+    /// Median grey value of black.
+    pub black: f64,
+    /// Share of the points next to which white is cut off.
+    pub saturated: f64,
+    /// Markers or discs in places where this board has others, or none.
+    pub strays: usize,
+}
+
+impl Quality {
+    fn of<'a>(points: impl Iterator<Item = &'a Refined>) -> Self {
+        let points: Vec<&Refined> = points.collect();
+        let median = |value: &dyn Fn(&Refined) -> f64| {
+            let mut values: Vec<f64> = points.iter().map(|p| value(p)).collect();
+            values.sort_unstable_by(f64::total_cmp);
+            values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+        };
+        let saturated = points.iter().filter(|p| p.white >= SATURATED).count();
+        Self {
+            blur_px: median(&|p| p.blur_px),
+            white: median(&|p| p.white),
+            black: median(&|p| p.black),
+            saturated: saturated as f64 / points.len().max(1) as f64,
+            strays: 0,
+        }
+    }
+}
+
+/// Why an image gave no points.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Problem {
+    /// No grid of corners or discs.
+    #[error("no board found among {corners} corners or spots")]
+    NoBoard {
+        /// Corners or spots found.
+        corners: usize,
+    },
+    /// A chessboard, but too few of its markers can be read.
+    #[error("a chessboard of {corners} corners whose markers cannot be read")]
+    NoMarkers {
+        /// Corners found.
+        corners: usize,
+    },
+    /// A grid of discs without its three hollow ones.
+    #[error("a grid of discs with {hollow} hollow ones in view: expected three in an L")]
+    NoOrigin {
+        /// Hollow discs found.
+        hollow: usize,
+    },
+    /// The board is seen, or printed, mirrored.
+    #[error("the board is mirrored")]
+    Mirrored,
+    /// Markers or discs are where this board has others.
+    #[error("another board: {markers} markers or discs are not where this board has them")]
+    OtherBoard {
+        /// How many.
+        markers: usize,
+    },
+    /// The image cannot be searched.
+    #[error("the image cannot be searched: {0}")]
+    Detector(String),
+}
+
+/// Finds the points of `board` in a raw image.
+///
+/// # Errors
+/// When there is no such board in it.
+pub fn detect(raw: &RawImage, board: &Board) -> Result<Detection, Problem> {
+    if raw.width() < 32 || raw.height() < 32 {
+        return Err(Problem::NoBoard { corners: 0 });
+    }
+    let gray = Gray::new(raw);
+    match board.pattern {
+        Pattern::Charuco => charuco::detect(&gray, board),
+        Pattern::Circles => circles::detect(&gray, board),
+    }
+}
