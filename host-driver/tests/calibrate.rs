@@ -27,7 +27,11 @@ fn sightings_without_noise_give_the_rig_back() {
 }
 
 /// Errors of detected points against where the true cameras see them, in px.
-fn errors(board: &Board, view: &stspp::calibrate::View, truth: &stspp::calibrate::View) -> Vec<f64> {
+fn errors(
+    board: &Board,
+    view: &stspp::calibrate::View,
+    truth: &stspp::calibrate::View,
+) -> Vec<f64> {
     let _ = board;
     let mut errors = Vec::new();
     for side in 0..2 {
@@ -58,8 +62,16 @@ fn rendered_boards_are_found_to_a_fraction_of_a_pixel() {
             let right = detect::detect(&pair.right, &board);
             println!("render {t1:?} detect {:?}", t.elapsed());
             let name = format!("{k}");
-            println!("{:?} {:?}", left.as_ref().map(|l| l.quality), right.as_ref().map(|l| l.quality));
-            let view = View { name, left: left.map(|l| l.sightings).unwrap_or_default(), right: right.map(|r| r.sightings).unwrap_or_default() };
+            println!(
+                "{:?} {:?}",
+                left.as_ref().map(|l| l.quality),
+                right.as_ref().map(|l| l.quality)
+            );
+            let view = View {
+                name,
+                left: left.map(|l| l.sightings).unwrap_or_default(),
+                right: right.map(|r| r.sightings).unwrap_or_default(),
+            };
             let errors = errors(&board, &view, &expected.views[k]);
             let seen = expected.views[k].left.len() + expected.views[k].right.len();
             let max = errors.iter().copied().fold(0.0, f64::max);

@@ -18,7 +18,14 @@ enum Print {
     /// Square modules, row by row from the top.
     Modules { columns: usize, rows: usize, module_m: f64, is_black: Vec<bool> },
     /// Discs on a grid; those that are rings have a white middle.
-    Discs { columns: usize, rows: usize, pitch_m: f64, radius_m: f64, hole_m: f64, rings: Vec<bool> },
+    Discs {
+        columns: usize,
+        rows: usize,
+        pitch_m: f64,
+        radius_m: f64,
+        hole_m: f64,
+        rings: Vec<bool>,
+    },
 }
 
 impl BoardTexture {
@@ -112,8 +119,8 @@ impl BoardTexture {
             }
             Print::Discs { columns, rows, pitch_m, radius_m, hole_m, rings } => {
                 cell(*pitch_m, *columns, *rows).is_some_and(|(c, r)| {
-                    let from_centre = (x - (c as f64 + 0.5) * pitch_m)
-                        .hypot(y - (r as f64 + 0.5) * pitch_m);
+                    let from_centre =
+                        (x - (c as f64 + 0.5) * pitch_m).hypot(y - (r as f64 + 0.5) * pitch_m);
                     from_centre <= *radius_m && !(rings[r * columns + c] && from_centre <= *hole_m)
                 })
             }

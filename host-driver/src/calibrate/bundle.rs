@@ -11,8 +11,8 @@ use nalgebra::{
     UnitQuaternion, Vector2, Vector3, Vector6,
 };
 
-use super::eccentricity;
 use super::Board;
+use super::eccentricity;
 use super::observations::{Observations, View};
 use crate::{CameraIntrinsics, StereoCalibration};
 
@@ -455,8 +455,8 @@ impl Problem<'_> {
                             rig_rotation.matrix() * left_by_pose
                         })
                     };
-                    let projection = state.cameras[side]
-                        .project_with_derivatives(&Point3::from(in_camera))?;
+                    let projection =
+                        state.cameras[side].project_with_derivatives(&Point3::from(in_camera))?;
                     let px = projection.pixel + self.offset(index) - sighting.pixel;
                     index += 1;
                     let (loss, weight) = self.loss.of(px.norm() / self.sigma_px);
@@ -464,9 +464,7 @@ impl Problem<'_> {
                     let weight = weight / self.sigma_px.powi(2);
                     let by_pose: Matrix2x6<f64> = projection.by_point * by_pose;
                     let mut by_shared = SMatrix::<f64, 2, SHARED>::zeros();
-                    by_shared
-                        .fixed_columns_mut::<8>(8 * side)
-                        .copy_from(&projection.by_intrinsics);
+                    by_shared.fixed_columns_mut::<8>(8 * side).copy_from(&projection.by_intrinsics);
                     if side == 1 {
                         let turned = in_camera - state.right_from_left.translation.vector;
                         by_shared

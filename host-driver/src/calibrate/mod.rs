@@ -6,15 +6,24 @@
 
 pub mod board;
 pub mod bundle;
+pub mod collect;
+pub mod coverage;
+pub mod date;
 pub mod detect;
 pub mod dictionary;
 pub mod eccentricity;
+pub mod findings;
 pub mod homography;
+pub mod images;
 pub mod observations;
+pub mod print;
 #[cfg(feature = "sim")]
 pub mod rendered;
+pub mod report;
 pub mod solve;
 pub mod tour;
+#[cfg(feature = "sim")]
+pub mod trials;
 pub mod zhang;
 
 pub use board::{Board, BoardError, Pattern};

@@ -9,8 +9,8 @@ use super::{Board, Pattern};
 use crate::accuracy::capture::raw_of;
 use crate::recording::StereoPair;
 
-/// Exposure under the floodlight that shows a white board at 1 m with about 170 of 255 grey values.
-pub const EXPOSURE_US: u64 = 4_000;
+/// Exposure under the floodlight that shows a white board at 1 m with half of full scale.
+pub const EXPOSURE_US: u64 = 30_000;
 
 /// The board as a printed target of the simulator.
 pub fn texture(board: &Board) -> BoardTexture {

@@ -32,7 +32,9 @@ pub enum SolveError {
         given: usize,
     },
     /// The adjustment failed.
-    #[error("{0}: expected boards at several distances, tilted by 20 to 40 degrees in all directions")]
+    #[error(
+        "{0}: expected boards at several distances, tilted by 20 to 40 degrees in all directions"
+    )]
     Bundle(#[from] BundleError),
     /// The result is no rig.
     #[error("the result is no possible sensor: {0}")]
@@ -88,10 +90,7 @@ impl Solution {
     pub fn depth_sigma_m(&self, depth_m: f64) -> Option<f64> {
         let state = &self.adjusted.state;
         let calibration = state.calibration();
-        let middle = calibration.right_from_left.inverse().translation.vector / 2.0;
-        let point = Point3::new(middle.x + depth_m * axis(&calibration).x, 0.0, depth_m);
-        let left = calibration.left.project(&point)?;
-        let right = calibration.right.project(&(calibration.right_from_left * point))?;
+        let (left, right) = on_axis_px(&calibration, depth_m)?;
         // Depth of the same pixels when one unknown is off by its own standard deviation, which is
         // small enough for the derivative.
         let mut gradient = nalgebra::SVector::<f64, { bundle::SHARED }>::zeros();
@@ -108,6 +107,26 @@ impl Solution {
         }
         Some((gradient.transpose() * self.adjusted.covariance * gradient)[0].max(0.0).sqrt())
     }
+
+    /// Error of the depth that this calibration gives for the point at `depth_m` on the axis of the
+    /// true rig: what [`Self::depth_sigma_m`] estimates.
+    pub fn depth_error_on_axis_m(&self, truth: &StereoCalibration, depth_m: f64) -> Option<f64> {
+        let (left, right) = on_axis_px(truth, depth_m)?;
+        Some(self.calibration().triangulate(left, right)?.z - depth_m)
+    }
+}
+
+/// Where both cameras see the point at `depth_m` on the sensor's axis, which begins midway between
+/// them.
+fn on_axis_px(
+    calibration: &StereoCalibration,
+    depth_m: f64,
+) -> Option<(nalgebra::Vector2<f64>, nalgebra::Vector2<f64>)> {
+    let middle = calibration.right_from_left.inverse().translation.vector / 2.0;
+    let point = Point3::from(middle + axis(calibration) * (depth_m - middle.z));
+    let left = calibration.left.project(&point)?;
+    let right = calibration.right.project(&(calibration.right_from_left * point))?;
+    Some((left, right))
 }
 
 /// Mean of the optical axes in the left camera's frame.
@@ -212,7 +231,8 @@ fn fits(observations: &Observations, adjusted: &Adjusted) -> Vec<Option<ViewFit>
         .map(|view| {
             let pose = adjusted.state.left_from_board[view]?;
             let side_rms = |side: usize| {
-                let of_side = adjusted.residuals.iter().filter(|r| (r.view, r.side) == (view, side));
+                let of_side =
+                    adjusted.residuals.iter().filter(|r| (r.view, r.side) == (view, side));
                 rms(of_side.map(|r| r.px.norm()))
             };
             Some(fit(observations, adjusted, view, pose, [0, 1].map(side_rms), true))
@@ -229,9 +249,8 @@ fn fit_left_out(
 ) -> Option<ViewFit> {
     let (pose, residuals) =
         bundle::adjust_pose(&observations.board, &observations.views[view], &adjusted.state, pose)?;
-    let side_rms = |side: usize| {
-        rms(residuals.iter().filter(|r| r.side == side).map(|r| r.px.norm()))
-    };
+    let side_rms =
+        |side: usize| rms(residuals.iter().filter(|r| r.side == side).map(|r| r.px.norm()));
     Some(fit(observations, adjusted, view, pose, [0, 1].map(side_rms), false))
 }
 

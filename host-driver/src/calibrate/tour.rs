@@ -2,13 +2,12 @@
 //! see of it. The simulator moves boards along it, and the statistical tests draw their sightings
 //! from it.
 
-use nalgebra::{
-    Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3,
-};
+use nalgebra::{Isometry3, Point2, Point3, Translation3, UnitQuaternion, Vector2, Vector3};
 
 use super::Board;
 use super::observations::{Observations, Sighting, View};
 use crate::StereoCalibration;
+use crate::rectify::rect_from_left;
 
 /// Distances that the tour goes through, as parts of the range from near to far.
 const DISTANCES: [f64; 5] = [0.0, 0.62, 0.22, 1.0, 0.4];
@@ -120,12 +119,8 @@ impl Tour {
 
 /// Rotation of a board that faces the sensor upright, in the left camera's frame.
 fn facing(rig: &StereoCalibration) -> UnitQuaternion<f64> {
-    let left_from_right = rig.right_from_left.inverse();
-    let x = left_from_right.translation.vector.normalize();
-    let axes = Vector3::z() + left_from_right.rotation * Vector3::z();
-    let z = (axes - x * axes.dot(&x)).normalize();
-    let matrix = Matrix3::from_columns(&[x, z.cross(&x), z]);
-    UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(matrix))
+    let rect_from_left = rect_from_left(rig).unwrap_or_default();
+    UnitQuaternion::from_rotation_matrix(&rect_from_left.inverse())
 }
 
 /// The point at `depth_m` that camera `side` sees at a place of its image, in the left camera's frame.
@@ -151,6 +146,18 @@ pub fn sightings(
     sigma_px: f64,
     draw: &mut Draw,
 ) -> Observations {
+    sightings_of_print(rig, board, &|p| p, left_from_board, sigma_px, draw)
+}
+
+/// [`sightings`] of a print that is not as the board says: `print` tells where a point really is.
+pub fn sightings_of_print(
+    rig: &StereoCalibration,
+    board: &Board,
+    print: &dyn Fn(Point2<f64>) -> Point2<f64>,
+    left_from_board: &[Isometry3<f64>],
+    sigma_px: f64,
+    draw: &mut Draw,
+) -> Observations {
     let margin_px = 8.0;
     let mut see = |side: usize, left_from_board: &Isometry3<f64>| {
         let (camera, pose) = if side == 0 {
@@ -161,13 +168,13 @@ pub fn sightings(
         let [width, height] = camera.resolution_px.map(|size| size as f64 - 1.0 - margin_px);
         (0..board.point_count())
             .filter_map(|point| {
-                let p = board.point_m(point);
+                let p = print(board.point_m(point));
                 let mut pixel = camera.project(&(pose * Point3::new(p.x, p.y, 0.0)))?;
                 if let Some(radius_m) = board.disc_radius_m() {
                     pixel += super::eccentricity::of_disc(camera, &pose, p, radius_m)?;
                 }
-                let is_inside = (margin_px..width).contains(&pixel.x)
-                    && (margin_px..height).contains(&pixel.y);
+                let is_inside =
+                    (margin_px..width).contains(&pixel.x) && (margin_px..height).contains(&pixel.y);
                 pixel += Vector2::new(draw.normal(), draw.normal()) * sigma_px;
                 is_inside.then_some(Sighting { point, pixel })
             })

@@ -6,9 +6,9 @@ use nalgebra::{
     Isometry3, Matrix2, Matrix3, Point2, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3,
 };
 
+use super::Board;
 use super::homography;
 use super::observations::{Observations, Sighting};
-use super::Board;
 use crate::CameraIntrinsics;
 
 /// Fewest points of a view from which a pose is estimated.
@@ -56,11 +56,7 @@ pub fn estimate(observations: &Observations, side: usize) -> Start {
 }
 
 /// Homography from the board's plane (metres) to pixels relative to the image's middle.
-fn of_sighting(
-    board: &Board,
-    sighting: &[Sighting],
-    middle: Vector2<f64>,
-) -> Option<Matrix3<f64>> {
+fn of_sighting(board: &Board, sighting: &[Sighting], middle: Vector2<f64>) -> Option<Matrix3<f64>> {
     if sighting.len() < POINTS_MIN {
         return None;
     }

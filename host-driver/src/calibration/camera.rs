@@ -44,12 +44,7 @@ impl CameraIntrinsics {
     /// Intrinsics from [fu, fv, pu, pv, k1, k2, p1, p2].
     pub fn from_vector(values: [f64; 8], resolution_px: [usize; 2]) -> Self {
         let [fu, fv, pu, pv, k1, k2, p1, p2] = values;
-        Self {
-            focal_px: [fu, fv],
-            principal_px: [pu, pv],
-            radtan: [k1, k2, p1, p2],
-            resolution_px,
-        }
+        Self { focal_px: [fu, fv], principal_px: [pu, pv], radtan: [k1, k2, p1, p2], resolution_px }
     }
 
     /// [`Self::project`] with the derivatives by the point and by the intrinsics.
@@ -61,8 +56,7 @@ impl CameraIntrinsics {
         let n = point_camera.coords.xy() / z;
         let (d, d_by_n) = self.distort_with_jacobian(n);
         let focal = Matrix2::new(self.focal_px[0], 0.0, 0.0, self.focal_px[1]);
-        let n_by_point =
-            Matrix2x3::new(1.0 / z, 0.0, -n.x / z, 0.0, 1.0 / z, -n.y / z);
+        let n_by_point = Matrix2x3::new(1.0 / z, 0.0, -n.x / z, 0.0, 1.0 / z, -n.y / z);
         let r2 = n.norm_squared();
         let mut by_intrinsics = SMatrix::<f64, 2, 8>::zeros();
         let coefficients = [

@@ -11,6 +11,7 @@ use std::path::Path;
 
 use nalgebra::{Matrix3, Vector3};
 
+use super::text::{list, number};
 use super::yaml::{self, Field, Node};
 use super::{CalibrationError, CameraIntrinsics, FieldError, StereoCalibration, isometry};
 use crate::export::atomic;
@@ -112,17 +113,18 @@ pub fn to_text(calibration: &StereoCalibration) -> String {
     let mut camera = |name: &str, camera: &CameraIntrinsics, extra: &str| {
         let ([fu, fv], [pu, pv]) = (camera.focal_px, camera.principal_px);
         let ([k1, k2, p1, p2], [w, h]) = (camera.radtan, camera.resolution_px);
-        // `{:?}` prints the shortest digits that read back as the same f64.
+        let intrinsics = list([fu, fv, pu, pv]);
+        let coefficients = list([k1, k2, p1, p2]);
         let _ = write!(
             text,
-            "{name}:\n  camera_model: pinhole\n  intrinsics: [{fu:?}, {fv:?}, {pu:?}, {pv:?}]\n  \
-             distortion_model: radtan\n  distortion_coeffs: [{k1:?}, {k2:?}, {p1:?}, {p2:?}]\n  \
+            "{name}:\n  camera_model: pinhole\n  intrinsics: {intrinsics}\n  \
+             distortion_model: radtan\n  distortion_coeffs: {coefficients}\n  \
              resolution: [{w}, {h}]\n{extra}"
         );
     };
     let mut extra = String::new();
     if let Some(temperature_c) = calibration.temperature_c {
-        let _ = writeln!(extra, "  temperature_c: {temperature_c:?}");
+        let _ = writeln!(extra, "  temperature_c: {}", number(temperature_c));
     }
     if let Some(date) = &calibration.date {
         let _ = writeln!(extra, "  calibration_date: '{}'", date.replace('\'', "''"));
@@ -131,7 +133,7 @@ pub fn to_text(calibration: &StereoCalibration) -> String {
     let m = calibration.right_from_left.to_homogeneous();
     let mut extra = String::from("  T_cn_cnm1:\n");
     for row in m.row_iter() {
-        let _ = writeln!(extra, "  - [{:?}, {:?}, {:?}, {:?}]", row[0], row[1], row[2], row[3]);
+        let _ = writeln!(extra, "  - {}", list(row.iter().copied()));
     }
     camera("cam1", &calibration.right, &extra);
     text

@@ -1,14 +1,16 @@
 //! Calibration of the stereo rig: two distorted pinhole cameras and their relative pose.
 //!
 //! The product's format is Kalibr's `camchain.yaml` ([`kalibr`]); OpenCV's stereo YAML ([`opencv`])
-//! and pairs of ROS camera_info files ([`ros`]) are imported.
+//! and pairs of ROS camera_info files ([`ros`]) are imported and [exported](export).
 
 mod camera;
 mod epipolar;
 mod error;
+pub mod export;
 pub mod kalibr;
 pub mod opencv;
 pub mod ros;
+mod text;
 mod yaml;
 
 use std::path::Path;

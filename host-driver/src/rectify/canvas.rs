@@ -12,7 +12,9 @@ const CANVAS_MAX_PX: f64 = 16_384.0;
 
 /// Axes of the rectified frame: x along the baseline; z the mean of both optical axes as far as it is
 /// perpendicular to x, so that neither camera is stretched more than the other.
-fn rect_from_left(calibration: &StereoCalibration) -> Result<Rotation3<f64>, RectifyError> {
+pub(crate) fn rect_from_left(
+    calibration: &StereoCalibration,
+) -> Result<Rotation3<f64>, RectifyError> {
     let left_from_right = calibration.right_from_left.inverse();
     let x = left_from_right.translation.vector.normalize();
     let axes = Vector3::z() + left_from_right.rotation * Vector3::z();

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use stspp_matcher::{DisparityRange, Image, Sample};
 
 use crate::{RawImage, RectifiedGeometry, StereoCalibration};
+pub(crate) use canvas::rect_from_left;
 pub use kernel::Kernel;
 pub use warp::RectifyScratch;
 use warp::{Virtual, Warp};

@@ -1,7 +1,9 @@
-//! `stspp bench`: time per stage, and accuracy against truth.
+//! `stspp bench`: time per stage, and accuracy and calibration against truth.
 
 #[cfg(feature = "sim")]
 mod accuracy;
+#[cfg(feature = "sim")]
+mod calibration;
 mod timing;
 
 use clap::Subcommand;
@@ -9,7 +11,7 @@ use clap::Subcommand;
 use crate::exit::Failure;
 use crate::output::Output;
 
-/// Measure time per stage (the default), or accuracy.
+/// Measure time per stage (the default), accuracy, or calibration.
 #[derive(clap::Args)]
 #[command(args_conflicts_with_subcommands = true)]
 pub struct Args {
@@ -23,6 +25,8 @@ pub struct Args {
 enum What {
     #[cfg(feature = "sim")]
     Accuracy(accuracy::Args),
+    #[cfg(feature = "sim")]
+    Calibration(calibration::Args),
 }
 
 /// Runs the verb.
@@ -30,6 +34,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     match &args.what {
         #[cfg(feature = "sim")]
         Some(What::Accuracy(args)) => accuracy::run(args, output),
+        #[cfg(feature = "sim")]
+        Some(What::Calibration(args)) => calibration::run(args, output),
         #[cfg(not(feature = "sim"))]
         Some(_) => Ok(()),
         None => timing::run(&args.timing, output),

@@ -1,6 +1,7 @@
 //! The `stspp` command line: one file per verb.
 
 mod bench;
+mod calibrate;
 mod capture;
 mod completions;
 #[cfg(feature = "sim")]
@@ -52,6 +53,7 @@ enum Verb {
     Capture(capture::Args),
     Record(record::Args),
     Play(stream::PlayArgs),
+    Calibrate(Box<calibrate::Args>),
     Bench(bench::Args),
     Completions(completions::Args),
 }
@@ -71,6 +73,7 @@ fn main() -> ExitCode {
         Verb::Capture(args) => capture::run(&args, &output),
         Verb::Record(args) => record::run(&args, &output),
         Verb::Play(args) => stream::play(&args, &output),
+        Verb::Calibrate(args) => calibrate::run(&args, &output),
         Verb::Bench(args) => bench::run(&args, &output),
         Verb::Completions(args) => completions::run(&args),
     };

@@ -46,9 +46,7 @@ struct Corner {
 pub fn detect(gray: &Gray, board: &Board) -> Result<Detection, Problem> {
     let config = DetectorConfig::chess().with_threshold(RESPONSE_MIN);
     let seen = Detector::new(config)
-        .and_then(|mut d| {
-            d.detect_u8(&gray.to_u8(), gray.width() as u32, gray.height() as u32)
-        })
+        .and_then(|mut d| d.detect_u8(&gray.to_u8(), gray.width() as u32, gray.height() as u32))
         .map_err(|error| Problem::Detector(error.to_string()))?;
     let seen: Vec<&CornerDescriptor> = seen.iter().filter(|c| c.axes.is_some()).collect();
     let points: Vec<Vector2<f64>> =
@@ -94,9 +92,10 @@ pub fn detect(gray: &Gray, board: &Board) -> Result<Detection, Problem> {
             best = Some((placement, lattice));
         }
         let enough = ENOUGH * board.point_count() as f64;
-        if best.as_ref().is_some_and(|(p, grown)| {
-            p.votes >= VOTES_MIN && grown.len() as f64 >= enough
-        }) {
+        if best
+            .as_ref()
+            .is_some_and(|(p, grown)| p.votes >= VOTES_MIN && grown.len() as f64 >= enough)
+        {
             break;
         }
     }
@@ -203,8 +202,7 @@ impl Pose {
         };
         let (column, row) = (column + dx - 1, row + dy - 1);
         let (columns, rows) = board.points();
-        let inside =
-            (0..columns as i32).contains(&column) && (0..rows as i32).contains(&row);
+        let inside = (0..columns as i32).contains(&column) && (0..rows as i32).contains(&row);
         inside.then(|| row as usize * columns + column as usize)
     }
 }

@@ -204,8 +204,7 @@ fn seed_vectors(points: &[Vector2<f64>], seed: usize) -> Option<[Vector2<f64>; 2
     let first = *near.first()?;
     let is_opposite = |a: &Vector2<f64>, b: &Vector2<f64>| (a + b).norm() < 0.3 * a.norm();
     let opposite = near.iter().position(|v| is_opposite(&first, v))?;
-    let rest: Vec<_> =
-        (1..near.len()).filter(|&k| k != opposite).map(|k| near[k]).collect();
+    let rest: Vec<_> = (1..near.len()).filter(|&k| k != opposite).map(|k| near[k]).collect();
     let [second, third] = rest[..] else { return None };
     if !is_opposite(&second, &third) {
         return None;
@@ -219,19 +218,15 @@ fn placed(
     lattice: &Lattice,
     board: &Board,
 ) -> Result<impl Fn(Cell) -> Option<usize>, Problem> {
-    let hollow: Vec<Cell> = lattice
-        .iter()
-        .filter(|(_, spot)| spots[**spot].is_hollow)
-        .map(|(cell, _)| *cell)
-        .collect();
+    let hollow: Vec<Cell> =
+        lattice.iter().filter(|(_, spot)| spots[**spot].is_hollow).map(|(cell, _)| *cell).collect();
     let [a, b, c] = hollow[..] else {
         return Err(Problem::NoOrigin { hollow: hollow.len() });
     };
     let minus = |p: Cell, q: Cell| (p.0 - q.0, p.1 - q.1);
     let mut found = None;
     let mut is_mirrored = false;
-    for [corner, long, short] in
-        [[a, b, c], [a, c, b], [b, a, c], [b, c, a], [c, a, b], [c, b, a]]
+    for [corner, long, short] in [[a, b, c], [a, c, b], [b, a, c], [b, c, a], [c, a, b], [c, b, a]]
     {
         let (x, y) = (minus(long, corner), minus(short, corner));
         let is_l = x.0 * y.0 + x.1 * y.1 == 0

@@ -79,9 +79,8 @@ pub fn fit<const N: usize>(
         for pixel in pixels {
             let value = model(&p, pixel.x, pixel.y);
             // In units of the natural steps, which makes the unknowns comparable.
-            let slope = SVector::<f64, N>::from_fn(|k, _| {
-                model(&moved[k], pixel.x, pixel.y) - value
-            });
+            let slope =
+                SVector::<f64, N>::from_fn(|k, _| model(&moved[k], pixel.x, pixel.y) - value);
             normal += slope * slope.transpose();
             right += slope * (pixel.value - value);
         }

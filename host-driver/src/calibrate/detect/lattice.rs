@@ -107,7 +107,11 @@ pub fn grow(
 }
 
 /// The vectors from a cell to its neighbours to the right and below, from the points about it.
-pub fn vectors(points: &[Vector2<f64>], lattice: &Lattice, cell: Cell) -> Option<[Vector2<f64>; 2]> {
+pub fn vectors(
+    points: &[Vector2<f64>],
+    lattice: &Lattice,
+    cell: Cell,
+) -> Option<[Vector2<f64>; 2]> {
     let here = points[*lattice.get(&cell)?];
     let along = |step: Cell| {
         let ahead = lattice.get(&(cell.0 + step.0, cell.1 + step.1)).map(|&i| points[i] - here);

@@ -77,13 +77,11 @@ pub fn corner(
             0.0,
             0.0,
         ]);
-        let steps =
-            SVector::<f64, 9>::from([0.02, 0.02, 0.01, 0.01, 0.02, 0.5, 0.5, 0.05, 0.05]);
+        let steps = SVector::<f64, 9>::from([0.02, 0.02, 0.01, 0.01, 0.02, 0.5, 0.5, 0.05, 0.05]);
         let fitted = fit::fit(&pixels, begin, &steps, |p, x, y| {
             let (x, y) = (x - p[0], y - p[1]);
             let blur = p[4].exp();
-            let product =
-                edge(distance(p[2], x, y) / blur) * edge(distance(p[3], x, y) / blur);
+            let product = edge(distance(p[2], x, y) / blur) * edge(distance(p[3], x, y) / blur);
             p[5] + p[6] * product + p[7] * x + p[8] * y
         })?;
         let p = fitted.parameters;
@@ -158,8 +156,7 @@ pub fn disc(gray: &Gray, start: Ellipse, white: f64, black: f64) -> Option<Refin
             0.0,
         ]);
         let s = 0.02 / largest;
-        let steps =
-            SVector::<f64, 10>::from([0.02, 0.02, s, s, s, 0.02, 0.5, 0.5, 0.05, 0.05]);
+        let steps = SVector::<f64, 10>::from([0.02, 0.02, s, s, s, 0.02, 0.5, 0.5, 0.05, 0.05]);
         let fitted = fit::fit(&pixels, begin, &steps, |p, x, y| {
             let (x, y) = (x - p[0], y - p[1]);
             let (a, b, c) = (a * p[2], b + a * p[3], c * p[4]);
