@@ -18,6 +18,7 @@
 pub mod accuracy;
 pub mod calibrate;
 pub mod calibration;
+pub mod check;
 pub mod cpu_time;
 pub mod export;
 pub mod frame;

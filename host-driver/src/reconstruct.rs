@@ -141,6 +141,22 @@ fn runs(numbers: &[usize]) -> Vec<Range<usize>> {
     runs
 }
 
+/// Reads the window of a recording that [`reconstruct`] would match, and its labels.
+///
+/// # Errors
+/// When the recording or the window are wrong.
+pub fn read_window(
+    recording: &Recording,
+    options: &Options,
+) -> Result<(Vec<crate::recording::StereoPair>, Vec<SlotLabel>), ReconstructError> {
+    let window = choose_window(recording, options)?;
+    let mut raw = Vec::new();
+    for run in runs(&window.pairs) {
+        raw.extend(recording.read_window(run)?);
+    }
+    Ok((raw, window.labels))
+}
+
 /// Reconstructs a window of a recording. `progress` is told what begins.
 ///
 /// # Errors

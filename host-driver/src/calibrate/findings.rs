@@ -105,15 +105,14 @@ pub fn findings(
     found
 }
 
-/// "image 03" or "images 03, 04 and 11", at most six by name.
+/// "images of 03, 04, 11", at most six pairs by name.
 fn images_named(names: &[&str]) -> String {
     let shown = &names[..names.len().min(6)];
     let rest = match names.len() - shown.len() {
         0 => String::new(),
         more => format!(" and {more} more"),
     };
-    let plural = if names.len() == 1 { "" } else { "s" };
-    format!("image{plural} {}{rest}", shown.join(", "))
+    format!("images of {}{rest}", shown.join(", "))
 }
 
 fn of_images(observations: &Observations, images: &[Images], found: &mut Vec<Finding>) {
@@ -258,9 +257,9 @@ fn of_result(solution: &Solution, baseline_m: Option<f64>, found: &mut Vec<Findi
     if aspects.iter().all(|aspect| (aspect - 1.0).abs() > ASPECT_TOLERANCE) {
         let mean = (aspects[0] + aspects[1]) / 2.0;
         let text = format!(
-            "both cameras seem to have pixels {:.1} % wider than high: the print is probably \
-             stretched; measure it in both directions",
-            100.0 * (1.0 / mean - 1.0)
+            "both cameras' focal lengths differ by {:+.1} % across and down, though pixels are square: \
+             the print is probably stretched; measure it in both directions",
+            100.0 * (mean - 1.0)
         );
         found.push(Finding { kind: Kind::StretchedPrint, text });
     }

@@ -4,6 +4,8 @@
 mod accuracy;
 #[cfg(feature = "sim")]
 mod calibration;
+#[cfg(feature = "sim")]
+mod check;
 mod timing;
 
 use clap::Subcommand;
@@ -27,6 +29,8 @@ enum What {
     Accuracy(accuracy::Args),
     #[cfg(feature = "sim")]
     Calibration(calibration::Args),
+    #[cfg(feature = "sim")]
+    Check(check::Args),
 }
 
 /// Runs the verb.
@@ -36,6 +40,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         Some(What::Accuracy(args)) => accuracy::run(args, output),
         #[cfg(feature = "sim")]
         Some(What::Calibration(args)) => calibration::run(args, output),
+        #[cfg(feature = "sim")]
+        Some(What::Check(args)) => check::run(args, output),
         #[cfg(not(feature = "sim"))]
         Some(_) => Ok(()),
         None => timing::run(&args.timing, output),

@@ -73,8 +73,10 @@ enum LossName {
     Cauchy,
 }
 
+pub use convert::calibration_failure;
+
 /// A file that is not to be replaced.
-fn refuse_existing(path: &std::path::Path, force: bool) -> Result<(), Failure> {
+pub fn refuse_existing(path: &std::path::Path, force: bool) -> Result<(), Failure> {
     if path.exists() && !force {
         let what = format!("{}: exists already", path.display());
         return Err(Failure::new(Kind::Output, what).remedy("give another name, or --force"));

@@ -3,6 +3,7 @@
 mod bench;
 mod calibrate;
 mod capture;
+mod check;
 mod completions;
 #[cfg(feature = "sim")]
 mod demo;
@@ -54,6 +55,7 @@ enum Verb {
     Record(record::Args),
     Play(stream::PlayArgs),
     Calibrate(Box<calibrate::Args>),
+    Check(check::Args),
     Bench(bench::Args),
     Completions(completions::Args),
 }
@@ -74,6 +76,7 @@ fn main() -> ExitCode {
         Verb::Record(args) => record::run(&args, &output),
         Verb::Play(args) => stream::play(&args, &output),
         Verb::Calibrate(args) => calibrate::run(&args, &output),
+        Verb::Check(args) => check::run(&args, &output),
         Verb::Bench(args) => bench::run(&args, &output),
         Verb::Completions(args) => completions::run(&args),
     };
