@@ -73,7 +73,7 @@ impl Sheet {
         let candidates = PAPERS.iter().filter(|(name, _)| paper.is_none_or(|p| p == *name));
         let chosen = candidates.clone().find(|(_, size)| fits(*size));
         let Some(&(paper, size_mm)) = chosen else {
-            let &(paper, paper_mm) = candidates.clone().last().unwrap_or(&PAPERS[4]);
+            let &(paper, paper_mm) = candidates.clone().next_back().unwrap_or(&PAPERS[4]);
             return Err(PaperError { size_mm: print_mm, paper, paper_mm });
         };
         let origin_mm =

@@ -172,8 +172,7 @@ pub fn solve(observations: &Observations, loss: Loss) -> Result<Solution, SolveE
     let mut views = fits(observations, &adjusted);
     let poses_of_all = adjusted.state.left_from_board.clone();
     // Views that do not fit are left out, the worst first, as long as enough remain.
-    loop {
-        let Some(worst) = worst_outlier(observations, &views) else { break };
+    while let Some(worst) = worst_outlier(observations, &views) {
         let mut state = adjusted.state.clone();
         state.left_from_board[worst] = None;
         adjusted = bundle::adjust(observations, state, loss)?;

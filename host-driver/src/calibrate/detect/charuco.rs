@@ -325,10 +325,8 @@ fn read_marker(
         return None;
     }
     let mut code = 0_u16;
-    for row in 2..MARKER_MODULES {
-        for column in 2..MARKER_MODULES {
-            code = code << 1 | u16::from(values[row][column] > middle);
-        }
+    for value in values[2..MARKER_MODULES].iter().flat_map(|row| &row[2..MARKER_MODULES]) {
+        code = code << 1 | u16::from(*value > middle);
     }
     Some(code)
 }
