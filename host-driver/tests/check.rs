@@ -182,9 +182,9 @@ fn an_injected_turn_is_found_and_corrected() {
             trials::injected(&scene, &model, turned_deg, 5, &options, Axes::default()).unwrap();
         println!("{}", trial.report.to_text());
         println!("error {:?}", trial.error_deg);
-        for k in [0, 2] {
-            assert!(trial.error_deg[k].abs() < 0.005, "axis {k}: {:?}", trial.error_deg);
-        }
+        // Nothing turned about y: a yaw that this small recording cannot tell is not put in.
+        assert!(trial.error_deg.iter().all(|e| e.abs() < 0.005), "{:?}", trial.error_deg);
+        assert_eq!(trial.report.drift.correction_deg[1], 0.0);
         assert!(trial.report.before.rms_px > 0.5 && trial.report.after.rms_px < 0.1);
     }
 }

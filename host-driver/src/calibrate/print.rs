@@ -9,9 +9,9 @@ use super::Board;
 use super::board::Pattern;
 
 /// White around the print, in mm, that detection needs.
-const MARGIN_MM: f64 = 8.0;
+const MARGIN_MM: f64 = 5.0;
 /// Room for the ruler and the text below the print.
-const FOOT_MM: f64 = 9.0;
+const FOOT_MM: f64 = 6.0;
 /// Millimetres of a point, the unit of PDF.
 const MM_PER_PT: f64 = 25.4 / 72.0;
 /// Handle length of a quarter circle as a Bezier curve, in radii; off by 0.03 % at most.

@@ -15,6 +15,10 @@ use crate::calibration::essential;
 
 /// Residual at which the weight of a window falls, in robust standard deviations (Cauchy).
 const KNEE: f64 = 2.4;
+/// Standard deviations from which on an angle is real.
+pub const SIGNIFICANT: f64 = 4.0;
+/// Index of the yaw among the angles.
+const YAW: usize = 1;
 /// Rounds of the reweighted fit.
 const ROUNDS: usize = 20;
 /// Blocks across and down that are left out in turn to see how far the result hangs on each.
@@ -47,19 +51,30 @@ impl Axes {
 /// A turn of the right camera about its own centre.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Drift {
-    /// Angles about the camera's x (pitch), y (yaw) and z (roll) axes.
+    /// Angles about the camera's x (pitch), y (yaw) and z (roll) axes, all fitted together.
     pub angles_deg: [f64; 3],
     /// Their standard deviations, from the scatter of the windows and from leaving out parts of the
     /// field; 0 for axes that were not looked at.
     pub sigmas_deg: [f64; 3],
+    /// The turn to correct: without a yaw that is within [`SIGNIFICANT`] standard deviations, the
+    /// other angles then fitted without it. An uncertain yaw is the one error that costs depth.
+    pub correction_deg: [f64; 3],
     /// Robust standard deviation of what the turn leaves, in px.
     pub rest_px: f64,
 }
 
 impl Drift {
-    /// A calibration with the turn.
+    /// Whether any angle to correct is larger than its uncertainty.
+    pub fn is_significant(&self) -> bool {
+        (0..3).any(|k| {
+            self.correction_deg[k] != 0.0
+                && self.angles_deg[k].abs() > SIGNIFICANT * self.sigmas_deg[k]
+        })
+    }
+
+    /// A calibration with the turn corrected.
     pub fn applied(&self, calibration: &StereoCalibration) -> StereoCalibration {
-        let turn = Vector3::from(self.angles_deg.map(f64::to_radians));
+        let turn = Vector3::from(self.correction_deg.map(f64::to_radians));
         let right_from_left = turned(&calibration.right_from_left, &turn);
         StereoCalibration { right_from_left, ..calibration.clone() }
     }
@@ -110,10 +125,20 @@ pub fn fit(
     let spread = parts.iter().map(|p| (p - mean).component_mul(&(p - mean))).sum::<Vector3<f64>>();
     let jackknife = (spread * ((n - 1.0) / n)).map(f64::sqrt);
     let sigma = whole.sigma.sup(&jackknife);
+    let mut correction = whole.turn;
+    let mut rest = whole.rest;
+    if axes.yaw && whole.turn[YAW].abs() <= SIGNIFICANT * sigma[YAW] {
+        let others: Vec<usize> = free.into_iter().filter(|&k| k != YAW).collect();
+        (correction, rest) = match fit_turn(&calibration.right_from_left, &all, &others) {
+            Some(fit) => (fit.turn, fit.rest),
+            None => (Vector3::zeros(), whole.rest),
+        };
+    }
     Ok(Drift {
+        correction_deg: correction.map(f64::to_degrees).into(),
         angles_deg: whole.turn.map(f64::to_degrees).into(),
         sigmas_deg: sigma.map(f64::to_degrees).into(),
-        rest_px: whole.rest * matches.focal_px,
+        rest_px: rest * matches.focal_px,
     })
 }
 

@@ -15,8 +15,6 @@ use crate::rectify::rect_from_left;
 pub const GOOD_PX: f64 = 0.1;
 /// Epipolar RMS up to which it can be used; beyond, points are lost and depths are off.
 pub const USABLE_PX: f64 = 0.3;
-/// Standard deviations from which on a turn is real.
-const SIGNIFICANT: f64 = 4.0;
 
 /// A calibration's state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -97,11 +95,7 @@ impl Report {
             values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
         };
         let drift = &checked.drift;
-        let is_significant = drift
-            .angles_deg
-            .iter()
-            .zip(drift.sigmas_deg)
-            .any(|(angle, sigma)| sigma > 0.0 && angle.abs() > SIGNIFICANT * sigma);
+        let is_significant = drift.is_significant();
         Self {
             verdict,
             windows: [
@@ -159,6 +153,9 @@ impl Report {
             let (angle, sigma) = (self.drift.angles_deg[k], self.drift.sigmas_deg[k]);
             let note = match (sigma > 0.0, k) {
                 (false, _) => "  not looked at",
+                (true, 1) if self.drift.correction_deg[1] == 0.0 => {
+                    "  seen by keystone only, within its uncertainty: left as it is"
+                }
                 (true, 1) => "  seen by keystone only",
                 _ => "",
             };

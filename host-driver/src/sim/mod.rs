@@ -8,6 +8,7 @@
 //! Nothing here labels a frame: a camera exposes while its trigger pin is high, whatever was lit, and
 //! counts and stamps its frames by a clock of its own.
 
+pub mod boards;
 pub mod cameras;
 pub mod link;
 pub mod options;

@@ -2,6 +2,7 @@
 
 use stspp_hil_sim::world::{SceneSpec, SensorModel, list_scenes};
 
+use super::boards::{self, BoardTour};
 use crate::{Error, UriError};
 
 /// Scene when none is named: the paper's Figure 2.
@@ -122,6 +123,13 @@ impl SimOptions {
                 _ => of_scene.push((name.as_str(), value.as_str())),
             }
         }
+        if scene_name == boards::NAME {
+            let tour = BoardTour::parse(&of_scene)?;
+            let model = model(seed, scale, bits, rig_seed);
+            let scene_name = scene_name.to_owned();
+            let scene = tour.scene(&model);
+            return Ok(Self { scene, scene_name, seed, scale, bits, pace, rig_seed, mcu });
+        }
         let known = list_scenes().iter().find(|s| s.name == scene_name);
         let unknown = of_scene
             .iter()
@@ -138,13 +146,17 @@ impl SimOptions {
 
     /// The sensor's optics and electronics.
     pub fn model(&self) -> SensorModel {
-        let model = match self.rig_seed {
-            Some(seed) => SensorModel::perturbed(seed),
-            None => SensorModel::with_seed(self.seed),
-        };
-        let model = model.with_bits(self.bits);
-        if self.scale > 1 { model.scaled_down(self.scale) } else { model }
+        model(self.seed, self.scale, self.bits, self.rig_seed)
     }
+}
+
+fn model(seed: u64, scale: usize, bits: u8, rig_seed: Option<u64>) -> SensorModel {
+    let model = match rig_seed {
+        Some(seed) => SensorModel::perturbed(seed),
+        None => SensorModel::with_seed(seed),
+    };
+    let model = model.with_bits(bits);
+    if scale > 1 { model.scaled_down(scale) } else { model }
 }
 
 #[cfg(test)]

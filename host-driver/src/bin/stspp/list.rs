@@ -39,9 +39,9 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
 
 #[cfg(feature = "sim")]
 fn scenes(output: &Output) -> Result<(), Failure> {
-    let scenes = stspp_hil_sim::world::list_scenes();
+    let scenes = stspp::sim::boards::scenes();
     let mut text = String::new();
-    for scene in scenes {
+    for scene in &scenes {
         text += &format!("sim:{}  {}\n", scene.name, scene.summary);
         for option in scene.options {
             text += &format!("    {}={}  {}\n", option.name, option.default, option.summary);

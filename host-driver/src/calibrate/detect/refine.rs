@@ -187,18 +187,22 @@ mod tests {
     use super::*;
     use stspp_matcher::Image;
 
-    /// Draws by supersampling: `is_white` at 16x16 places of each pixel, then a Gaussian blur is left
-    /// to the pixel's own square.
+    /// Draws what a lens with a Gaussian spread of 0.65 px images, by sampling about each pixel.
     fn drawn(size: usize, is_white: impl Fn(f64, f64) -> bool) -> Gray {
+        let offset = |k: i32| f64::from(k) / 10.0;
+        let weight = |k: i32| (-0.5 * (offset(k) / 0.65).powi(2)).exp();
         let mut pixels = Image::new(size, size, 0.0_f32);
         for y in 0..size {
             for x in 0..size {
-                let mut sum = 0;
-                for i in 0..256 {
-                    let (dx, dy) = ((i % 16) as f64 / 16.0 - 0.47, (i / 16) as f64 / 16.0 - 0.47);
-                    sum += i32::from(is_white(x as f64 + dx, y as f64 + dy));
+                let (mut sum, mut total) = (0.0, 0.0);
+                for (i, j) in (-20..=20).flat_map(|i| (-20..=20).map(move |j| (i, j))) {
+                    let w = weight(i) * weight(j);
+                    total += w;
+                    if is_white(x as f64 + offset(i), y as f64 + offset(j)) {
+                        sum += w;
+                    }
                 }
-                pixels.set(x, y, 20.0 + 200.0 * sum as f32 / 256.0);
+                pixels.set(x, y, (20.0 + 200.0 * sum / total) as f32);
             }
         }
         Gray { pixels }
