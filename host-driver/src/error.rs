@@ -40,6 +40,17 @@ pub enum Error {
     /// The calibration is not possible.
     #[error(transparent)]
     Calibration(#[from] CalibrationError),
+    /// Nobody has said how this sensor's cameras see.
+    #[error(transparent)]
+    NoCalibration(#[from] CalibrationMissing),
+    /// Another sensor answers than the one that was open.
+    #[error("sensor {got} answers instead of {expected}; open it as a sensor of its own")]
+    OtherSensor {
+        /// Serial number of the one that was open.
+        expected: String,
+        /// Serial number of the one that answers.
+        got: String,
+    },
     /// The images cannot be rectified.
     #[error(transparent)]
     Rectify(#[from] RectifyError),
@@ -105,6 +116,19 @@ pub enum Error {
     /// The stream has ended.
     #[error("the stream has ended; open another one")]
     Stopped,
+}
+
+/// There is no calibration for a sensor.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "no calibration of sensor {serial}: looked for {}; put its camchain.yaml there, or name one by \
+     `?calibration=FILE`", .looked_for.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ")
+)]
+pub struct CalibrationMissing {
+    /// Serial number of the sensor.
+    pub serial: String,
+    /// Files that were looked for.
+    pub looked_for: Vec<PathBuf>,
 }
 
 /// What did not come in time.

@@ -1,5 +1,7 @@
 //! The sensor: open it, set what it projects, stream depth.
 
+#[cfg(target_os = "linux")]
+pub mod open;
 mod session;
 
 use std::path::Path;
@@ -20,9 +22,10 @@ use stspp_protocol::version::{Capabilities, DeviceInfo, PROTOCOL_VERSION};
 
 use crate::camera::CameraSource;
 use crate::clock::{Clock, MonotonicClock};
+use crate::error::CalibrationMissing;
 use crate::pipeline::stream::{self, PairSource};
 use crate::pipeline::{DepthStream, PairStream, StreamOptions};
-use crate::transport::{Link, LinkStats, Transport};
+use crate::transport::{Link, LinkStats, Transport, TransportError};
 use crate::{Error, ProjectionTiming, Recording, SourceUri, StereoCalibration, timing};
 
 pub(crate) use session::Session;
@@ -42,12 +45,12 @@ pub struct SensorInfo {
     pub protocol: Option<String>,
     /// Version of the protocol that this library speaks.
     pub host_protocol: String,
-    /// Width of the cameras' images in pixels.
-    pub width_px: usize,
-    /// Height of the cameras' images in pixels.
-    pub height_px: usize,
-    /// Distance of the cameras in metres.
-    pub baseline_m: f64,
+    /// Width of the cameras' images in pixels; `None` without a calibration.
+    pub width_px: Option<usize>,
+    /// Height of the cameras' images in pixels; `None` without a calibration.
+    pub height_px: Option<usize>,
+    /// Distance of the cameras in metres; `None` without a calibration.
+    pub baseline_m: Option<f64>,
     /// Constants that every timing is held against; `None` for a recording.
     pub limits: Option<Limits>,
 }
@@ -62,13 +65,25 @@ pub struct Parts {
     pub cameras: Box<dyn CameraSource>,
     /// The clock that waits run on.
     pub clock: Arc<dyn Clock>,
-    /// Calibration of the cameras.
-    pub calibration: StereoCalibration,
+    /// Calibration of the cameras, or where one was looked for.
+    pub calibration: Result<StereoCalibration, CalibrationMissing>,
+    /// Opens the control link anew after it was lost; `None` where the transport goes on by itself.
+    pub reopen: Option<Reopen>,
 }
 
+/// Waits for a sensor to be there again, at most so long, and opens its control link.
+pub type Reopen = Box<dyn FnMut(Duration) -> Result<Box<dyn Transport>, TransportError> + Send>;
+
 enum Backend {
-    Live { session: Arc<Session>, device: DeviceInfo, keep_alive: Option<KeepAlive> },
-    Replay { recording: Arc<Recording> },
+    Live {
+        session: Arc<Session>,
+        device: DeviceInfo,
+        keep_alive: Option<KeepAlive>,
+        reopen: Option<Reopen>,
+    },
+    Replay {
+        recording: Arc<Recording>,
+    },
 }
 
 /// A 3D sensor, or what stands in for one.
@@ -102,11 +117,16 @@ impl Sensor {
     /// As [`Sensor::open`].
     pub fn open_uri(source: &SourceUri) -> Result<Self, Error> {
         match source {
-            SourceUri::Usb { .. } => {
-                Err(Error::NotBuiltIn { scheme: "usb", remedy: "use sim: or replay:" })
+            #[cfg(feature = "usb")]
+            SourceUri::Usb { serial, options } => {
+                Self::from_parts(open::usb(source, serial.as_deref(), options)?)
             }
-            SourceUri::Serial { .. } => {
-                Err(Error::NotBuiltIn { scheme: "serial", remedy: "use sim: or replay:" })
+            #[cfg(not(feature = "usb"))]
+            SourceUri::Usb { .. } => {
+                Err(Error::NotBuiltIn { scheme: "usb", remedy: "build with the feature `usb`" })
+            }
+            SourceUri::Serial { path, options } => {
+                Self::from_parts(open::serial(source, path.as_deref(), options)?)
             }
             #[cfg(feature = "sim")]
             SourceUri::Sim { scene, options } => {
@@ -142,7 +162,7 @@ impl Sensor {
         let session = Arc::new(Session::new(parts.clock, link, parts.cameras, parts.calibration));
         // Simulated time stands still between calls, so that no heartbeat can be missed.
         let keep_alive = (!is_virtual).then(|| KeepAlive::start(&session)).flatten();
-        let backend = Backend::Live { session, device, keep_alive };
+        let backend = Backend::Live { session, device, keep_alive, reopen: parts.reopen };
         Ok(Self { source: parts.source, backend, streaming: Arc::default() })
     }
 
@@ -153,7 +173,7 @@ impl Sensor {
 
     /// What this sensor is.
     pub fn info(&self) -> SensorInfo {
-        let calibration = self.calibration();
+        let calibration = self.calibration().ok();
         let device = match &self.backend {
             Backend::Live { device, .. } => Some(device),
             Backend::Replay { .. } => None,
@@ -165,19 +185,49 @@ impl Sensor {
             firmware: device.map(|d| d.firmware.to_string()),
             protocol: device.map(|d| d.protocol.to_string()),
             host_protocol: PROTOCOL_VERSION.to_string(),
-            width_px: calibration.left.resolution_px[0],
-            height_px: calibration.left.resolution_px[1],
-            baseline_m: calibration.baseline_m(),
+            width_px: calibration.map(|c| c.left.resolution_px[0]),
+            height_px: calibration.map(|c| c.left.resolution_px[1]),
+            baseline_m: calibration.map(StereoCalibration::baseline_m),
             limits: device.map(|d| d.limits),
         }
     }
 
     /// The calibration in use.
-    pub fn calibration(&self) -> &StereoCalibration {
+    ///
+    /// # Errors
+    /// [`Error::NoCalibration`] for a real sensor that has none yet: it can be asked and set, and gives
+    /// raw pairs, but no depth.
+    pub fn calibration(&self) -> Result<&StereoCalibration, Error> {
         match &self.backend {
-            Backend::Live { session, .. } => &session.calibration,
-            Backend::Replay { recording } => &recording.calibration,
+            Backend::Live { session, .. } => session.calibration(),
+            Backend::Replay { recording } => Ok(&recording.calibration),
         }
+    }
+
+    /// Opens the control link again after the sensor was unplugged, restarted or given up: waits up to
+    /// `timeout` for it to be there. Streams can be started again then; cameras are opened at their
+    /// start anyway.
+    ///
+    /// # Errors
+    /// When it does not come back in time, or another one comes; while a stream is running.
+    pub fn reconnect(&mut self, timeout: Duration) -> Result<(), Error> {
+        let Backend::Live { session, device, reopen, .. } = &mut self.backend else {
+            return Err(Error::Unsupported { scheme: "replay", what: "be plugged in again" });
+        };
+        let _lease = Lease::take(&self.streaming).ok_or(Error::Streaming)?;
+        let mut link = session.link();
+        if let Some(reopen) = reopen {
+            // The old link is closed first: nobody else may hold the device.
+            link.close(&self.source.to_string());
+            link.replace(reopen(timeout)?);
+        }
+        let found = link.hello()?;
+        if found.serial != device.serial {
+            let (expected, got) = (device.serial.to_string(), found.serial.to_string());
+            return Err(Error::OtherSensor { expected, got });
+        }
+        *device = found;
+        Ok(())
     }
 
     /// The recording that is replayed, if this is one.

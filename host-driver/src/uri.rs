@@ -1,21 +1,26 @@
 //! Where depth frames come from: `usb:`, `serial:`, `sim:` and `replay:`.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 /// A parsed source.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SourceUri {
-    /// `usb:` (the only sensor) or `usb:SERIAL`.
+    /// `usb:` (the only sensor) or `usb:SERIAL`, with `?OPTION=VALUE&...`.
     Usb {
         /// Serial number, where more than one sensor is plugged in.
         serial: Option<String>,
+        /// Options in the order given; [`crate::sensor::open`] has their table.
+        options: Vec<(String, String)>,
     },
-    /// `serial:PATH`, such as `serial:/dev/ttyUSB0`.
+    /// `serial:` (the only sensor at a USB bridge) or `serial:PATH`, such as `serial:/dev/ttyUSB0`, with
+    /// `?OPTION=VALUE&...`.
     Serial {
-        /// The port.
-        path: PathBuf,
+        /// The port; found by probing when `None`.
+        path: Option<PathBuf>,
+        /// Options in the order given, as with `usb:`.
+        options: Vec<(String, String)>,
     },
     /// `sim:`, `sim:SCENE` or `sim:SCENE?OPTION=VALUE&...`.
     Sim {
@@ -39,7 +44,7 @@ pub enum SourceUri {
 pub enum UriError {
     /// It has no scheme, or one that is not known.
     #[error(
-        "{uri:?} names no source: expected usb:, usb:SERIAL, serial:PORT, sim:, sim:SCENE or replay:FOLDER"
+        "{uri:?} names no source: expected usb:, usb:SERIAL, serial:, serial:PORT, sim:, sim:SCENE or replay:FOLDER"
     )]
     Scheme {
         /// What was given.
@@ -93,9 +98,14 @@ impl FromStr for SourceUri {
         let (scheme, rest) = uri.split_once(':').ok_or_else(unknown)?;
         let missing = |what, example| UriError::Missing { uri: uri.to_owned(), what, example };
         match scheme {
-            "usb" => Ok(Self::Usb { serial: (!rest.is_empty()).then(|| rest.to_owned()) }),
-            "serial" if rest.is_empty() => Err(missing("a port", "serial:/dev/ttyUSB0")),
-            "serial" => Ok(Self::Serial { path: rest.into() }),
+            "usb" => {
+                let (serial, options) = split_options(uri, rest)?;
+                Ok(Self::Usb { serial: (!serial.is_empty()).then(|| serial.to_owned()), options })
+            }
+            "serial" => {
+                let (path, options) = split_options(uri, rest)?;
+                Ok(Self::Serial { path: (!path.is_empty()).then(|| path.into()), options })
+            }
             "sim" => {
                 let (scene, options) = split_options(uri, rest)?;
                 Ok(Self::Sim { scene: (!scene.is_empty()).then(|| scene.to_owned()), options })
@@ -143,8 +153,14 @@ impl fmt::Display for SourceUri {
             Ok(())
         };
         match self {
-            Self::Usb { serial } => write!(f, "usb:{}", serial.as_deref().unwrap_or_default()),
-            Self::Serial { path } => write!(f, "serial:{}", path.display()),
+            Self::Usb { serial, options } => {
+                write!(f, "usb:{}", serial.as_deref().unwrap_or_default())?;
+                with_options(f, options)
+            }
+            Self::Serial { path, options } => {
+                write!(f, "serial:{}", path.as_deref().unwrap_or(Path::new("")).display())?;
+                with_options(f, options)
+            }
             Self::Sim { scene, options } => {
                 write!(f, "sim:{}", scene.as_deref().unwrap_or_default())?;
                 with_options(f, options)
@@ -168,11 +184,18 @@ mod tests {
 
     #[test]
     fn every_scheme_is_understood() {
-        assert_eq!(parse("usb:"), Ok(SourceUri::Usb { serial: None }));
-        assert_eq!(parse("usb:A1"), Ok(SourceUri::Usb { serial: Some("A1".into()) }));
+        assert_eq!(parse("usb:"), Ok(SourceUri::Usb { serial: None, options: vec![] }));
+        assert_eq!(
+            parse("usb:A1?calibration=a.yaml"),
+            Ok(SourceUri::Usb {
+                serial: Some("A1".into()),
+                options: vec![("calibration".into(), "a.yaml".into())],
+            })
+        );
+        assert_eq!(parse("serial:"), Ok(SourceUri::Serial { path: None, options: vec![] }));
         assert_eq!(
             parse("serial:/dev/ttyUSB0"),
-            Ok(SourceUri::Serial { path: "/dev/ttyUSB0".into() })
+            Ok(SourceUri::Serial { path: Some("/dev/ttyUSB0".into()), options: vec![] })
         );
         assert_eq!(parse("sim:"), Ok(SourceUri::Sim { scene: None, options: vec![] }));
         assert_eq!(
@@ -193,7 +216,6 @@ mod tests {
         let message = |uri: &str| parse(uri).unwrap_err().to_string();
         assert!(message("plane").contains("expected usb:"));
         assert!(message("http://x").contains("names no source"));
-        assert!(message("serial:").contains("lacks a port"));
         assert!(message("replay:").contains("lacks a recording folder"));
         assert!(message("sim:plane?seed").contains("\"seed\""));
     }
@@ -201,7 +223,8 @@ mod tests {
     proptest! {
         #[test]
         fn any_text_parses_or_is_refused_and_round_trips(text in "\\PC{0,40}") {
-            for uri in [text.clone(), format!("sim:{text}"), format!("replay:{text}")] {
+            let schemes = ["", "sim:", "replay:", "usb:", "serial:"];
+            for uri in schemes.map(|scheme| format!("{scheme}{text}")) {
                 if let Ok(parsed) = parse(&uri) {
                     prop_assert_eq!(parse(&parsed.to_string()), Ok(parsed));
                 }

@@ -70,6 +70,18 @@ struct Link {
     exposure_ns: u64,
     readout_ns: u64,
     drift_ppm: [i64; 2],
+    sof: Sof,
+}
+
+/// What the cameras say of the USB bus's frame number.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Sof {
+    /// Nothing.
+    None,
+    /// That of the device's bus, one off now and then.
+    Shared,
+    /// Something else.
+    Wrong,
 }
 
 impl Link {
@@ -90,6 +102,7 @@ impl Link {
                 + self.exposure_ns
                 + 300_000
                 + u64::from(sequence * 7 % 5) * 90_000,
+            usb_sof: Some((device_ns / 1_000_000 % 2048) as u16),
         }
     }
 
@@ -129,6 +142,14 @@ impl Link {
                     timestamp_camera_ns: camera(device_ns) + u64::from(sequence * 13 % 7) * 10_000,
                     arrival_host_ns: 3_000_000_000 + device_ns + self.exposure_ns + self.readout_ns,
                     fingerprint: None,
+                    usb_sof: match self.sof {
+                        Sof::None => None,
+                        Sof::Shared => {
+                            let off = u64::from(sequence % 3);
+                            Some(((device_ns / 1_000_000 + 2047 + off) % 2048) as u16)
+                        }
+                        Sof::Wrong => Some((sequence * 611 % 2048) as u16),
+                    },
                 };
                 *count += 1;
                 match fault {
@@ -222,6 +243,7 @@ fn paper_link() -> Link {
         exposure_ns: 32_000_000,
         readout_ns: 9_000_000,
         drift_ppm: [37, -52],
+        sof: Sof::None,
     }
 }
 
@@ -238,6 +260,7 @@ fn a_thousand_triggers_a_second_pair_too() {
         exposure_ns: 800_000,
         readout_ns: 700_000,
         drift_ppm: [80, -80],
+        sof: Sof::None,
     };
     let faults = vec![(EventFault::None, [FrameFault::None; 2]); 500];
     assert_eq!(run(&link, &faults), (FIRST..FIRST + 500).collect::<Vec<_>>());
@@ -287,6 +310,20 @@ fn a_camera_clock_that_jumps_by_a_period_is_tied_again() {
 }
 
 #[test]
+fn a_bus_that_all_share_makes_up_for_slow_transfers() {
+    // Every frame takes four periods, more than the pairer waits for: only the bus's frame numbers say
+    // which trigger it belongs to.
+    let slow = FrameFault::Delayed(400);
+    let faults = vec![(EventFault::None, [slow; 2]); 80];
+    let shared = Link { sof: Sof::Shared, ..paper_link() };
+    assert!(run(&shared, &faults).len() >= 70);
+    // Numbers of another bus are found out, and done without.
+    let clean = vec![(EventFault::None, [FrameFault::None; 2]); 120];
+    let wrong = Link { sof: Sof::Wrong, ..paper_link() };
+    assert!(run(&wrong, &clean).len() >= 80);
+}
+
+#[test]
 fn a_lost_first_frame_delays_the_lock_but_shifts_nothing() {
     let mut faults = vec![(EventFault::None, [FrameFault::None; 2]); 60];
     faults[0].1[0] = FrameFault::Missed;
@@ -321,6 +358,7 @@ fn a_repeated_image_is_a_duplicate() {
         timestamp_camera_ns: 33_333_000 * u64::from(sequence),
         arrival_host_ns: 33_333_000 * u64::from(sequence),
         fingerprint: Some(42),
+        usb_sof: None,
     };
     pairer.push_frame(stamp(0), (), &mut out);
     pairer.push_frame(stamp(1), (), &mut out);
@@ -337,12 +375,14 @@ proptest! {
         drift_ppm in [-100i64..100, -100i64..100],
         readout_us in 200u64..20_000,
         period_us in 5_000u64..40_000,
+        sof in prop_oneof![Just(Sof::None), Just(Sof::Shared), Just(Sof::Wrong)],
     ) {
         let link = Link {
             period_ns: period_us * 1000,
             exposure_ns: period_us * 960,
             readout_ns: (readout_us * 1000).min(period_us * 700),
             drift_ppm,
+            sof,
         };
         let total = faults.len() as u32;
         let mut faults = faults;

@@ -89,7 +89,8 @@ fn a_replay_equals_the_reconstruction_of_the_same_folder() {
         .into_iter()
         .map(|pair| stspp::recording::StereoPair { left: pair.left, right: pair.right })
         .collect();
-    stspp::recording::write(&folder, sensor.calibration(), &images, &labels, true).unwrap();
+    stspp::recording::write(&folder, sensor.calibration().unwrap(), &images, &labels, true)
+        .unwrap();
 
     let recording = stspp::Recording::open(&folder).unwrap();
     let mut silent = |_: &'static str| {};

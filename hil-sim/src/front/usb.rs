@@ -166,4 +166,7 @@ pub trait UsbFunction: Send {
     fn is_attached(&self) -> bool {
         true
     }
+
+    /// The host has let go of the device: unplugged, as far as the device can tell.
+    fn detach(&mut self) {}
 }

@@ -138,15 +138,15 @@ impl CameraUnit {
         }
     }
 
-    pub fn expose(
+    /// Electrons of each pixel after an exposure, before any noise.
+    pub fn collect(
         &self,
         scene: &Scene,
         lights: &Lights,
         open_ns: u64,
         close_ns: u64,
         intervals: &[LightInterval],
-        frame_seed: u64,
-    ) -> RawImage {
+    ) -> Vec<f32> {
         let mut electrons = vec![0.0_f32; self.model.width * self.model.height];
         let mut add = |image: &[f32], seconds: f64| {
             electrons
@@ -193,7 +193,7 @@ impl CameraUnit {
                 add(&image, surroundings_s);
             }
         }
-        self.read_out(&electrons, frame_seed)
+        electrons
     }
 
     fn sub_exposures(&self, scene: &Scene, duration_ns: u64) -> u64 {
@@ -274,10 +274,10 @@ impl CameraUnit {
     }
 
     /// Electrons to numbers: shot noise, read noise, full well, gain, black level, quantisation.
-    fn read_out(&self, electrons: &[f32], frame_seed: u64) -> RawImage {
+    pub fn read_out(&self, electrons: &[f32], frame_seed: u64, gain: f64) -> RawImage {
         let m = &self.model;
         let frame_key = key(self.noise_seed, frame_seed);
-        let (gain, black) = (m.gain_dn_per_e as f32, m.black_level_dn as f32);
+        let (gain, black) = ((m.gain_dn_per_e * gain) as f32, m.black_level_dn as f32);
         let (full_well, top) = (m.full_well_e as f32, full_scale(m.bits) as f32);
         let mut data = vec![0_u16; electrons.len()];
         data.par_chunks_mut(m.width).enumerate().for_each(|(v, line)| {

@@ -111,7 +111,30 @@ impl World {
         lights: &[LightInterval],
         frame_seed: u64,
     ) -> RawImage {
-        self.unit(camera).expose(&self.scene, &self.lights, open_ns, close_ns, lights, frame_seed)
+        self.expose_with_gain(camera, open_ns, close_ns, lights, 1.0, frame_seed)
+    }
+
+    /// [`World::expose`] with an analog gain before the converter: signal and noise grow alike, and the
+    /// full well is reached at fewer numbers than there are.
+    #[must_use]
+    pub fn expose_with_gain(
+        &self,
+        camera: Camera,
+        open_ns: u64,
+        close_ns: u64,
+        lights: &[LightInterval],
+        gain: f64,
+        frame_seed: u64,
+    ) -> RawImage {
+        let unit = self.unit(camera);
+        let electrons = unit.collect(&self.scene, &self.lights, open_ns, close_ns, lights);
+        unit.read_out(&electrons, frame_seed, gain)
+    }
+
+    /// Whether nothing in the scene moves.
+    #[must_use]
+    pub fn is_still(&self) -> bool {
+        self.scene.is_still()
     }
 
     /// [`World::expose`] of both cameras, triggered together.

@@ -1,6 +1,8 @@
 //! The data path: camera frames with the camera's own sequence number and timestamp.
 
 #[cfg(target_os = "linux")]
+pub mod live;
+#[cfg(target_os = "linux")]
 pub mod v4l2;
 
 use std::time::Duration;
@@ -36,6 +38,12 @@ pub trait CameraSource: Send {
     /// When a camera is gone.
     fn next_frame(&mut self, timeout: Duration) -> Result<Option<CameraFrame>, CameraError>;
 
+    /// Frames of the left and right camera that arrived damaged and were dropped, since the source was
+    /// made.
+    fn damaged(&self) -> [u64; 2] {
+        [0; 2]
+    }
+
     /// Whether the source waits for its consumer instead of losing frames.
     fn is_lossless(&self) -> bool {
         false
@@ -51,6 +59,15 @@ pub enum CameraError {
     Gone {
         /// Which.
         side: Side,
+    },
+    /// There are none, or too many to choose from.
+    #[error(
+        "{found} cameras where the sensor is plugged in, expected one or two; check their cables, or \
+         name the nodes: `?left=/dev/video0&right=/dev/video2`"
+    )]
+    NotFound {
+        /// How many.
+        found: usize,
     },
     /// A frame has another size than the calibration.
     #[error(

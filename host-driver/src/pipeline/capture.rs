@@ -68,11 +68,21 @@ impl Capture {
         let session = Arc::clone(&self.session);
         let mut cameras = session.cameras();
         let lossless = cameras.is_lossless();
+        let mut seen_damaged = cameras.damaged();
         while !self.stop.is_stopped() {
             if !self.take_events()? {
                 return Ok(());
             }
             let frame = cameras.next_frame(SLICE)?;
+            let damaged = cameras.damaged();
+            if damaged != seen_damaged {
+                let new = [0, 1].map(|side| damaged[side] - seen_damaged[side]);
+                seen_damaged = damaged;
+                self.progress.count(|s| {
+                    s.damaged_left += new[0];
+                    s.damaged_right += new[1];
+                });
+            }
             let now_ns = self.session.clock.now_ns();
             let going_on = match frame {
                 Some(frame) => self.take_frame(frame, lossless)?,
@@ -149,6 +159,7 @@ impl Capture {
             },
             timing_generation: event.timing_generation,
             arrival_host_ns,
+            usb_sof: event.usb_sof,
         }))
     }
 

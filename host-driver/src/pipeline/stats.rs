@@ -68,6 +68,10 @@ pub struct StreamStats {
     pub frames_left: u64,
     /// Frames of the right camera.
     pub frames_right: u64,
+    /// Frames of the left camera that arrived damaged; not in `frames_left`.
+    pub damaged_left: u64,
+    /// Frames of the right camera that arrived damaged; not in `frames_right`.
+    pub damaged_right: u64,
     /// Frames that overtook another of their camera.
     pub overtaken: u64,
     /// Frames that came to nothing.

@@ -328,7 +328,7 @@ pub(crate) fn depth(source: PairSource, options: &StreamOptions) -> Result<Depth
     let (engine, cycles, live): (_, Cycles, _) = match &source {
         PairSource::Live { session, .. } => {
             let session = Arc::clone(session);
-            let engine = DepthEngine::new(&session.calibration, &options.matching)?;
+            let engine = DepthEngine::new(session.calibration()?, &options.matching)?;
             let cycles = move |generation| Some(Cycle::of(&session.timing(generation)?));
             (engine, Box::new(cycles), true)
         }

@@ -10,7 +10,7 @@ use stspp_protocol::request::{
 
 use crate::camera::{CameraError, CameraSource};
 use crate::clock::Clock;
-use crate::error::{Error, Faulted};
+use crate::error::{CalibrationMissing, Error, Faulted};
 use crate::sync::Side;
 use crate::transport::Link;
 use crate::{ProjectionTiming, RawImage, StereoCalibration};
@@ -23,7 +23,7 @@ const DUTY_WAIT_MAX: Duration = Duration::from_secs(10);
 
 pub(crate) struct Session {
     pub clock: Arc<dyn Clock>,
-    pub calibration: StereoCalibration,
+    calibration: Result<StereoCalibration, CalibrationMissing>,
     link: Mutex<Link>,
     cameras: Mutex<Box<dyn CameraSource>>,
     timings: Mutex<Vec<(u16, ProjectionTiming)>>,
@@ -39,7 +39,7 @@ impl Session {
         clock: Arc<dyn Clock>,
         link: Link,
         cameras: Box<dyn CameraSource>,
-        calibration: StereoCalibration,
+        calibration: Result<StereoCalibration, CalibrationMissing>,
     ) -> Self {
         Self {
             clock,
@@ -48,6 +48,11 @@ impl Session {
             cameras: Mutex::new(cameras),
             timings: Mutex::default(),
         }
+    }
+
+    /// Calibration of the cameras, where there is one.
+    pub fn calibration(&self) -> Result<&StereoCalibration, Error> {
+        self.calibration.as_ref().map_err(|missing| missing.clone().into())
     }
 
     pub fn link(&self) -> MutexGuard<'_, Link> {
@@ -155,9 +160,11 @@ impl Session {
     }
 
     pub fn check_size(&self, side: Side, image: &RawImage) -> Result<(), CameraError> {
+        // Raw pairs can be had without a calibration, for making one.
+        let Ok(calibration) = &self.calibration else { return Ok(()) };
         let camera = match side {
-            Side::Left => &self.calibration.left,
-            Side::Right => &self.calibration.right,
+            Side::Left => &calibration.left,
+            Side::Right => &calibration.right,
         };
         let (expected, got) = (camera.resolution_px, [image.width(), image.height()]);
         if expected == got { Ok(()) } else { Err(CameraError::Size { side, expected, got }) }

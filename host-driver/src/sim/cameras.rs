@@ -3,11 +3,11 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use stspp_hil_sim::rig::Exposure;
 use stspp_hil_sim::world::{Camera, World};
 
 use super::Rig;
 use super::options::Pace;
-use super::rig::Exposure;
 use crate::accuracy::capture::raw_of;
 use crate::camera::{CameraError, CameraFrame, CameraSource, fingerprint};
 use crate::sync::{FrameStamp, Side};
@@ -33,10 +33,10 @@ impl SimCameras {
     }
 
     fn render(&self, exposure: &Exposure) -> CameraFrame {
-        let side = exposure.side;
-        let camera = match side {
-            Side::Left => Camera::Left,
-            Side::Right => Camera::Right,
+        let camera = exposure.camera;
+        let side = match camera {
+            Camera::Left => Side::Left,
+            Camera::Right => Side::Right,
         };
         let Exposure { open_ns, close_ns, lights, .. } = exposure;
         // The time of the exposure makes its noise its own.
@@ -50,6 +50,8 @@ impl SimCameras {
             timestamp_camera_ns: (offset_ns + open_ns).wrapping_add_signed(drift_ns as i64),
             arrival_host_ns: exposure.ready_ns,
             fingerprint: fingerprint(&image),
+            // Pairing is to do without: real cameras rarely tell it.
+            usb_sof: None,
         };
         CameraFrame { stamp, image }
     }

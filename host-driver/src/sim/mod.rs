@@ -1,7 +1,7 @@
 //! The simulated sensor: the firmware's logic, the light and the cameras of `hil-sim`, joined.
 //!
-//! [`rig`] lets virtual time pass, turns the controller's pin edges into exposures and the times that
-//! lights were on; [`link`] is its control link as a [`Transport`](crate::transport::Transport);
+//! [`rig`] lets virtual time pass, in which the controller's pin edges become exposures and the times
+//! that lights were on ([`stspp_hil_sim::rig`]); [`link`] is its control link as a [`Transport`](crate::transport::Transport);
 //! [`cameras`] are its cameras as a [`CameraSource`](crate::camera::CameraSource); [`options`] is what
 //! may follow `sim:`.
 //!
@@ -18,6 +18,7 @@ use std::sync::{Arc, Mutex};
 
 use stspp_hil_sim::device::Controller;
 use stspp_hil_sim::device::in_process::{InProcess, InProcessOptions};
+use stspp_hil_sim::rig::readout_ns;
 use stspp_hil_sim::world::{CameraModel, SensorModel, World};
 
 use crate::clock::Clock;
@@ -71,7 +72,7 @@ impl SimSensor {
             .map_err(|error| Error::Simulation(error.to_string()))?;
         let world = Arc::new(world);
         let pixels = calibration.left.resolution_px[0] * calibration.left.resolution_px[1];
-        let rig = Rig::new(controller, options.pace, rig::readout_ns(pixels));
+        let rig = Rig::new(controller, options.pace, readout_ns(pixels));
         let clock = rig.clock();
         let rig = Arc::new(Mutex::new(rig));
         Ok(Self {
@@ -93,7 +94,8 @@ impl SimSensor {
             transport: Box::new(self.link),
             cameras: Box::new(self.cameras),
             clock: self.clock,
-            calibration: self.calibration,
+            calibration: Ok(self.calibration),
+            reopen: None,
         }
     }
 }

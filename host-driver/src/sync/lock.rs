@@ -8,6 +8,9 @@
 //! 2. counting: cameras are started before the triggers, so that the first frame (camera sequence 0)
 //!    is the first trigger's, unless one was lost.
 //!
+//! Where camera and device hang on one USB bus, both tell its frame number at the exposure's start: a
+//! third witness, which needs no other, as it is the same instant on one clock.
+//!
 //! Where both agree, four frames are enough. Where they do not (an exposure was missed at the start,
 //! or every frame was delayed by a period), the lock waits for twelve and follows causality.
 
@@ -72,13 +75,14 @@ pub fn find(triggers: &[Trigger], frames: &[FrameStamp], config: &LockConfig) ->
     let mut found: Vec<(&FrameStamp, &Trigger, i64)> = Vec::new();
     for frame in frames {
         let arrival_ns = frame.timestamp_camera_ns.wrapping_add_signed(host_from_camera_ns) as i64;
-        let candidate = triggers
-            .iter()
-            .rev()
-            .find(|t| exposure_end_host_ns(t) <= arrival_ns + config.slack_ns as i64);
+        let candidate = triggers.iter().rev().find(|t| {
+            t.sof_agrees(frame) != Some(false)
+                && exposure_end_host_ns(t) <= arrival_ns + config.slack_ns as i64
+        });
         if let Some(trigger) = candidate {
             let latency_ns = arrival_ns - exposure_end_host_ns(trigger);
-            if latency_ns < config.period_ns as i64 - config.slack_ns as i64 {
+            let proven = trigger.sof_agrees(frame) == Some(true);
+            if proven || latency_ns < config.period_ns as i64 - config.slack_ns as i64 {
                 found.push((frame, trigger, latency_ns));
             }
         }
@@ -97,7 +101,9 @@ pub fn find(triggers: &[Trigger], frames: &[FrameStamp], config: &LockConfig) ->
     let offset = |f: &FrameStamp, t: &Trigger| i64::from(t.label.sequence) - i64::from(f.sequence);
     let newest = found.last().map(|(f, t, _)| offset(f, t))?;
     found.retain(|(f, t, _)| offset(f, t) == newest);
-    let needed = if config.counted_offset == Some(newest) { FRAMES_AGREED } else { FRAMES_ALONE };
+    let proven = found.iter().all(|(f, t, _)| t.sof_agrees(f) == Some(true));
+    let agreed = proven || config.counted_offset == Some(newest);
+    let needed = if agreed { FRAMES_AGREED } else { FRAMES_ALONE };
     if found.len() < needed {
         return None;
     }
@@ -107,7 +113,7 @@ pub fn find(triggers: &[Trigger], frames: &[FrameStamp], config: &LockConfig) ->
         (-slack_ns..config.period_ns as i64 - slack_ns).contains(&latency_ns)
     };
     // The newest frames' own arrivals must say the same, whatever the timestamps of others were.
-    if !found.iter().rev().take(FRAMES_AGREED).all(|(f, t, _)| prompt(f, t)) {
+    if !proven && !found.iter().rev().take(FRAMES_AGREED).all(|(f, t, _)| prompt(f, t)) {
         return None;
     }
     let latency_ns = found.iter().map(|&(_, _, latency_ns)| latency_ns).min()?;
@@ -147,6 +153,7 @@ mod tests {
             },
             timing_generation: 0,
             arrival_host_ns: time_ns - 4_000_000_000 + 32_000_000 + 700_000,
+            usb_sof: Some((time_ns / 1_000_000 % 2048) as u16),
         }
     }
 
@@ -159,6 +166,7 @@ mod tests {
             timestamp_camera_ns: start_ns + 123_456_789_000,
             arrival_host_ns: start_ns - 4_000_000_000 + 32_000_000 + 8_000_000 + delay_ns,
             fingerprint: None,
+            usb_sof: None,
         }
     }
 
@@ -187,6 +195,18 @@ mod tests {
         assert!(find(&triggers, &frames, &CONFIG).is_none());
         frames.extend((8..12).map(|k| frame(k, k, 0)));
         assert_eq!(find(&triggers, &frames, &CONFIG).map(|lock| lock.offset), Some(0));
+    }
+
+    #[test]
+    fn frame_numbers_of_the_bus_lock_frames_however_late_they_are() {
+        let triggers: Vec<_> = (0..13).map(trigger).collect();
+        let with_sof = |k: u32| {
+            let usb_sof = trigger(k + 1).usb_sof.map(|sof| (sof + 1) % 2048);
+            FrameStamp { usb_sof, ..frame(k, k + 1, 3 * PERIOD_NS) }
+        };
+        // The first exposure was missed and every frame is three periods late: only the bus knows.
+        let frames: Vec<_> = (0..4).map(with_sof).collect();
+        assert_eq!(find(&triggers, &frames, &CONFIG).map(|lock| lock.offset), Some(1));
     }
 
     #[test]

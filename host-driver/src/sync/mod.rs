@@ -61,6 +61,9 @@ pub struct FrameStamp {
     pub arrival_host_ns: u64,
     /// Fingerprint of the pixels, where they have enough noise for two frames never to be equal.
     pub fingerprint: Option<u64>,
+    /// USB frame number (0..=2047, one a millisecond) at the start of exposure, where the camera tells it
+    /// and is on the device's bus.
+    pub usb_sof: Option<u16>,
 }
 
 /// A trigger event as it reached the host.
@@ -72,9 +75,23 @@ pub struct Trigger {
     pub timing_generation: u16,
     /// When the event reached the host, in nanoseconds of the host's clock.
     pub arrival_host_ns: u64,
+    /// USB frame number at the start of exposure, where the device is on USB.
+    pub usb_sof: Option<u16>,
 }
 
+/// USB frame numbers by which two samples of one instant may differ: each is rounded, and the camera's
+/// is carried back over the read-out.
+const SOF_TOLERANCE: u16 = 2;
+
 impl Trigger {
+    /// Whether the USB frame number at this trigger is that of `stamp`'s exposure; `None` where either
+    /// has none. Frame numbers come again after 2.048 s.
+    pub fn sof_agrees(&self, stamp: &FrameStamp) -> Option<bool> {
+        const MODULUS: u16 = stspp_protocol::usb::SOF_MODULUS;
+        let ahead = (stamp.usb_sof? % MODULUS + MODULUS - self.usb_sof? % MODULUS) % MODULUS;
+        Some(ahead <= SOF_TOLERANCE || ahead >= MODULUS - SOF_TOLERANCE)
+    }
+
     /// Start of the exposure in nanoseconds of the device's clock.
     pub fn time_device_ns(&self) -> u64 {
         self.label.trigger_time_us.saturating_mul(1000)

@@ -2,7 +2,8 @@
 //!
 //! A frame belongs to a trigger when three things agree: its timestamp is where the fitted line puts
 //! the trigger, the difference of the two sequence numbers is what it was, and it reached the host as
-//! long after its exposure's end as frames do. A frame that is only late waits until later frames have
+//! long after its exposure's end as frames do; or, on the device's own USB bus, when its timestamp and
+//! the bus's frame number agree. A frame that is only late waits until later frames have
 //! confirmed the first two; whatever else disagrees is rejected with a cause. Pairs come out in the
 //! triggers' order; a trigger waits for its frames, and a gap for its event, at most
 //! [`PairerConfig::patience_ns`].
@@ -178,12 +179,19 @@ impl Tied {
     fn latency_ns(&self) -> i64 {
         self.recent.iter().map(|&(_, latency_ns)| latency_ns).min().unwrap_or(0)
     }
+
+    fn longest_latency_ns(&self) -> u64 {
+        let longest_ns = self.recent.iter().map(|&(_, latency_ns)| latency_ns).max();
+        longest_ns.and_then(|ns| u64::try_from(ns).ok()).unwrap_or(0)
+    }
 }
 
 struct Camera<F> {
     tied: Option<Tied>,
     counted_offset: Option<i64>,
     held: VecDeque<(FrameStamp, F)>,
+    /// Its bus frame numbers fit no trigger: some cameras send anything there.
+    sof_is_wrong: bool,
     seen: VecDeque<(u32, Option<u64>)>,
 }
 
@@ -219,6 +227,7 @@ impl<F> Pairer<F> {
             tied: None,
             counted_offset: config.first_sequence.map(i64::from),
             held: VecDeque::new(),
+            sof_is_wrong: false,
             seen: VecDeque::new(),
         };
         Self {
@@ -251,7 +260,7 @@ impl<F> Pairer<F> {
     }
 
     /// Takes a camera frame.
-    pub fn push_frame(&mut self, stamp: FrameStamp, frame: F, out: &mut Vec<Outcome<F>>) {
+    pub fn push_frame(&mut self, mut stamp: FrameStamp, frame: F, out: &mut Vec<Outcome<F>>) {
         let camera = &mut self.cameras[stamp.side.index()];
         let repeated = camera.seen.iter().any(|&(sequence, fingerprint)| {
             sequence == stamp.sequence
@@ -269,8 +278,16 @@ impl<F> Pairer<F> {
         }
         camera.seen.push_back((stamp.sequence, stamp.fingerprint));
         if camera.held.len() == HELD {
+            // So many frames, and no lock in sight: without that witness, then.
+            if camera.tied.is_none() {
+                camera.sof_is_wrong = true;
+                camera.held.iter_mut().for_each(|(stamp, _)| stamp.usb_sof = None);
+            }
             let (stamp, frame) = camera.held.pop_front().expect("HELD is not 0");
             out.push(Outcome::Rejected { stamp, frame, cause: Reject::Unsynchronised });
+        }
+        if camera.sof_is_wrong {
+            stamp.usb_sof = None;
         }
         camera.held.push_back((stamp, frame));
         self.settle(stamp.arrival_host_ns, out);
@@ -392,6 +409,7 @@ impl<F> Pairer<F> {
             self.finished.iter().map(|f| (f.trigger, Place::Finished { paired: f.paired }));
         pending
             .chain(finished)
+            .filter(|(trigger, _)| trigger.sof_agrees(stamp) != Some(false))
             .filter_map(|(trigger, place)| {
                 let residual_ns =
                     fit.residual_ns(trigger.time_device_ns(), stamp.timestamp_camera_ns)?.abs();
@@ -437,7 +455,13 @@ impl<F> Pairer<F> {
         let latency_ns = stamp.arrival_host_ns as i64 - end_ns - host_from_device_ns.unwrap_or(0);
         let usual = (latency_ns - tied.latency_ns()).unsigned_abs() < self.config.period_ns / 2;
         let offset = offset_of(&trigger, stamp);
-        if offset != tied.offset {
+        // The bus's frame number is the same instant on one clock: no other witness is needed.
+        let proven = trigger.sof_agrees(stamp) == Some(true);
+        if offset != tied.offset && proven {
+            // Frames were lost before they were counted.
+            tied.offset = offset;
+            tied.recent.clear();
+        } else if offset != tied.offset {
             let count = match tied.changed {
                 Some((changed, count)) if changed == offset => count + 1,
                 _ => 1,
@@ -454,7 +478,8 @@ impl<F> Pairer<F> {
             tied.recent.clear();
         } else if latency_ns < -(self.config.slack_ns as i64) {
             return Verdict::Reject(Reject::Mislabelled);
-        } else if !usual
+        } else if !proven
+            && !usual
             && (tied.changed.is_some() || confirmations.is_none_or(|count| count < CONFIRM_LATE))
         {
             if patient {
@@ -478,6 +503,10 @@ impl<F> Pairer<F> {
     /// Lets go of the oldest triggers that are complete or have waited too long.
     fn emit(&mut self, now_host_ns: u64, out: &mut Vec<Outcome<F>>) {
         let locked = self.cameras.iter().all(|camera| camera.tied.is_some());
+        // A host that takes long to fetch a frame takes long to fetch each.
+        let usual_ns =
+            self.cameras.iter().filter_map(|c| Some(c.tied.as_ref()?.longest_latency_ns())).max();
+        let patience_ns = self.config.patience_ns + usual_ns.unwrap_or(0);
         while let Some(front) = self.pending.front() {
             let trigger = front.trigger;
             let sequence = trigger.label.sequence;
@@ -487,7 +516,7 @@ impl<F> Pairer<F> {
             // Before the lock nothing can have arrived, so that nothing is late either.
             let impatient = overfull
                 || if locked {
-                    waited_ns > trigger.exposure_ns() + self.config.patience_ns
+                    waited_ns > trigger.exposure_ns() + patience_ns
                 } else {
                     self.pending.len() > HELD
                 };

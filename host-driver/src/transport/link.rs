@@ -16,7 +16,7 @@ use stspp_protocol::request::{
 use stspp_protocol::version::{DeviceInfo, PROTOCOL_VERSION};
 use stspp_protocol::wire::{DecodeError, Frame, FrameDecoder, MAX_FRAME_LEN};
 
-use super::Transport;
+use super::{Transport, TransportError};
 use crate::clock::{Clock, duration_ns};
 use crate::error::{Error, Missing, Timeout};
 
@@ -55,6 +55,10 @@ pub struct LinkStats {
     pub stale_replies: u64,
     /// Events lost, seen by gaps in their count.
     pub events_lost: u64,
+    /// Bytes that came.
+    pub bytes_received: u64,
+    /// Replies and events that came.
+    pub messages: u64,
 }
 
 /// The device's clock against the host's, by the round trip of a heartbeat.
@@ -89,6 +93,19 @@ struct HeartbeatPlan {
     in_flight: Option<(u16, u64)>,
 }
 
+/// A transport that was closed.
+struct Closed(String);
+
+impl Transport for Closed {
+    fn write(&mut self, _bytes: &[u8], _timeout: Duration) -> Result<(), TransportError> {
+        Err(TransportError::Gone { link: self.0.clone() })
+    }
+
+    fn read(&mut self, _into: &mut Vec<u8>, _timeout: Duration) -> Result<usize, TransportError> {
+        Err(TransportError::Gone { link: self.0.clone() })
+    }
+}
+
 /// A reply frame's body, kept while its caller looks at it.
 struct RawReply {
     id: u8,
@@ -114,12 +131,34 @@ impl Link {
         }
     }
 
+    /// Gives the transport back.
+    pub fn into_transport(self) -> Box<dyn Transport> {
+        self.transport
+    }
+
+    /// Lets go of the transport: the link is gone from now on.
+    pub fn close(&mut self, name: &str) {
+        self.replace(Box::new(Closed(name.to_owned())));
+    }
+
+    /// Goes on over another transport, without a session. Counters go on.
+    pub fn replace(&mut self, transport: Box<dyn Transport>) {
+        self.transport = transport;
+        self.stats.frames_rejected += u64::from(self.decoder.rejected());
+        self.decoder = FrameDecoder::new();
+        self.bytes.clear();
+        self.events.clear();
+        self.next_event_seq = None;
+        self.heartbeat = None;
+        self.device_clock = None;
+    }
+
     /// Opens a session: versions are checked, the device stops and disarms, heartbeats begin.
     ///
     /// # Errors
     /// [`Error::Refused`] when the versions do not fit, [`Error::Timeout`] when nobody answers.
     pub fn hello(&mut self) -> Result<DeviceInfo, Error> {
-        let info = self.call(&Hello { host: PROTOCOL_VERSION })?;
+        let info = self.identify(&Hello { host: PROTOCOL_VERSION })?;
         if !info.protocol.is_compatible_with(PROTOCOL_VERSION) {
             return Err(Error::Refused {
                 request: "Hello",
@@ -132,6 +171,25 @@ impl Link {
             u64::from(info.limits.heartbeat_timeout_us) / 4,
         )));
         Ok(info)
+    }
+
+    /// Asks who is there, where it may be something else altogether.
+    ///
+    /// # Errors
+    /// [`TransportError::NotASensor`] when bytes come but no message, otherwise as [`Link::call`].
+    pub fn identify<C: Call<Reply = DeviceInfo>>(
+        &mut self,
+        request: &C,
+    ) -> Result<DeviceInfo, Error> {
+        let answer = self.call(request);
+        match self.stats {
+            LinkStats { messages: 0, bytes_received: bytes @ 1.., .. }
+                if matches!(answer, Err(Error::Timeout(_))) =>
+            {
+                Err(TransportError::NotASensor { bytes }.into())
+            }
+            _ => answer,
+        }
     }
 
     /// Sends a heartbeat whenever nothing else was sent for `interval`; none when `None`.
@@ -191,7 +249,8 @@ impl Link {
 
     /// What went wrong so far.
     pub fn stats(&self) -> LinkStats {
-        LinkStats { frames_rejected: u64::from(self.decoder.rejected()), ..self.stats }
+        let rejected = self.stats.frames_rejected + u64::from(self.decoder.rejected());
+        LinkStats { frames_rejected: rejected, ..self.stats }
     }
 
     /// When the device was last heard, in nanoseconds of the host's clock.
@@ -245,10 +304,12 @@ impl Link {
     fn receive(&mut self, timeout: Duration, seqs: &[u16]) -> Result<Option<RawReply>, Error> {
         let mut bytes = std::mem::take(&mut self.bytes);
         if bytes.is_empty() {
-            let read = self.transport.read(&mut bytes, timeout);
-            if let Err(error) = read {
-                self.bytes = bytes;
-                return Err(error.into());
+            match self.transport.read(&mut bytes, timeout) {
+                Ok(read) => self.stats.bytes_received += read as u64,
+                Err(error) => {
+                    self.bytes = bytes;
+                    return Err(error.into());
+                }
             }
         }
         let now_ns = self.clock.now_ns();
@@ -273,6 +334,7 @@ impl Link {
 
     fn handle(&mut self, frame: &Frame<'_>, now_ns: u64, seqs: &[u16]) -> Option<RawReply> {
         if frame.id & REPLY_BIT != 0 {
+            self.stats.messages += 1;
             if seqs.contains(&frame.seq) {
                 return Some(RawReply { id: frame.id, body: frame.body.to_vec() });
             }
@@ -281,6 +343,7 @@ impl Link {
         }
         match FromDevice::decode(frame) {
             Ok(FromDevice::Event { seq, event }) => {
+                self.stats.messages += 1;
                 if let Some(expected) = self.next_event_seq {
                     // A restarted device counts from the beginning.
                     if !matches!(event, Event::BootEvent(BootEvent { .. })) {

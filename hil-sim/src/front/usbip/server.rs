@@ -145,7 +145,9 @@ impl Server {
         reply.extend(wire::device_record(number, &identity));
         writer.write_all(&reply)?;
         writer.flush()?;
-        session::run(reader, writer, &export.function, &self.stop)
+        let result = session::run(reader, writer, &export.function, &self.stop);
+        lock(export)?.detach();
+        result
     }
 }
 

@@ -36,6 +36,12 @@ pub struct Settings {
 
 /// Where frames come from.
 pub trait FrameSource: Send {
+    /// The host has started the stream: frames are wanted from now on.
+    fn start(&mut self) {}
+
+    /// Nobody wants frames any more.
+    fn stop(&mut self) {}
+
     /// Lets time pass and gives the next frame if one is ready.
     fn poll(&mut self, settings: Settings) -> Option<Frame>;
 
@@ -84,7 +90,9 @@ impl<S: FrameSource> UvcCamera<S> {
     }
 
     fn stop(&mut self) {
-        self.streaming = false;
+        if std::mem::take(&mut self.streaming) {
+            self.source.stop();
+        }
         self.sending = None;
         self.waiting = None;
     }
@@ -145,6 +153,7 @@ impl<S: FrameSource> UsbFunction for UvcCamera<S> {
                 Some(controls::Outcome::Answer(bytes)) => Answer::Done(bytes),
                 Some(controls::Outcome::Committed) => {
                     self.stop();
+                    self.source.start();
                     self.streaming = true;
                     Answer::Done(vec![])
                 }
@@ -176,6 +185,10 @@ impl<S: FrameSource> UsbFunction for UvcCamera<S> {
 
     fn transfer_out(&mut self, _endpoint: u8, _data: &[u8]) -> Answer<usize> {
         Answer::Stall
+    }
+
+    fn detach(&mut self) {
+        self.stop();
     }
 
     fn poll(&mut self) {

@@ -20,16 +20,19 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let known = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".into());
     let mut text = format!(
         "source    {}\nserial    {}\nboard     {}, firmware {}, protocol {} (host {})\n\
-         cameras   2 x {}x{} px, baseline {:.1} mm\n",
+         cameras   {}\n",
         info.source,
         known(&info.serial),
         known(&info.board),
         known(&info.firmware),
         known(&info.protocol),
         info.host_protocol,
-        info.width_px,
-        info.height_px,
-        info.baseline_m * 1e3,
+        match (info.width_px, info.height_px, info.baseline_m) {
+            (Some(width), Some(height), Some(baseline_m)) => {
+                format!("2 x {width}x{height} px, baseline {:.1} mm", baseline_m * 1e3)
+            }
+            _ => "not calibrated".into(),
+        },
     );
     if let Some(recording) = sensor.recording() {
         text += &format!("recording {} pairs of {} bits\n", recording.len(), recording.bits());

@@ -47,9 +47,12 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         return Err(Failure::new(Kind::Usage, "--count is 0: expected at least 1"));
     }
     let mut out = OutputFolder::create(&args.folder, args.force).map_err(|e| output_failure(&e))?;
-    let calibration = kalibr::to_text(sensor.calibration());
-    out.file("camchain.yaml", |w| w.write_all(calibration.as_bytes()))
-        .map_err(|e| output_failure(&e))?;
+    // Pairs for a first calibration are recorded without one.
+    if let Ok(calibration) = sensor.calibration() {
+        let text = kalibr::to_text(calibration);
+        out.file("camchain.yaml", |w| w.write_all(text.as_bytes()))
+            .map_err(|e| output_failure(&e))?;
+    }
     let mut stream = sensor.pairs(&StreamOptions::default()).map_err(|e| failure(&e))?;
     interrupt::stops(stream.stop_handle());
     let digits = (count - 1).to_string().len().max(2);

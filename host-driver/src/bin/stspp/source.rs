@@ -53,6 +53,7 @@ pub fn failure(error: &Error) -> Failure {
         | Error::Simulation(_)
         | Error::Recording(_)
         | Error::Calibration(_)
+        | Error::NoCalibration(_)
         | Error::Rectify(_)
         | Error::Match(_)
         | Error::Timing(_)
@@ -63,6 +64,7 @@ pub fn failure(error: &Error) -> Failure {
         | Error::Refused { .. }
         | Error::Faulted(_)
         | Error::DeviceReset(_)
+        | Error::OtherSensor { .. }
         | Error::NotBuiltIn { .. }
         | Error::Unsupported { .. }
         | Error::Streaming => Kind::Sensor,

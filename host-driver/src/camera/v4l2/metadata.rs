@@ -17,6 +17,20 @@ pub struct HeaderTimes {
     pub source_clock: Option<(u32, u16)>,
 }
 
+impl HeaderTimes {
+    /// USB frame number (11 bits) at the start of exposure, carried back from the sample of the source
+    /// clock. `None` where there is no sample, or it is more than a second away from the exposure.
+    pub fn presentation_sof(&self, clock_hz: u32) -> Option<u16> {
+        let (sampled_ticks, sof) = self.source_clock?;
+        let ahead = i64::from(sampled_ticks.wrapping_sub(self.presentation_ticks) as i32);
+        if ahead.unsigned_abs() > u64::from(clock_hz) || clock_hz == 0 {
+            return None;
+        }
+        let frames = (ahead * 1000 + i64::from(clock_hz) / 2).div_euclid(i64::from(clock_hz));
+        Some((i64::from(sof) - frames).rem_euclid(2048) as u16)
+    }
+}
+
 /// Reads the first record of a metadata buffer that has a presentation time.
 pub fn parse(mut bytes: &[u8]) -> Option<HeaderTimes> {
     const PREFIX: usize = 10;
@@ -107,6 +121,18 @@ mod tests {
         assert_eq!(times.source_clock, Some((9, 0x7ff)));
         assert_eq!(parse(&bytes[..20]), None);
         assert_eq!(parse(&[]), None);
+    }
+
+    #[test]
+    fn the_frame_number_is_carried_back_to_the_exposure() {
+        let times =
+            |presentation_ticks, source_clock| HeaderTimes { presentation_ticks, source_clock };
+        // Sampled 40 ms after the exposure's start, over both wraps.
+        let late = times(u32::MAX - 9_999, Some((30_000, 15)));
+        assert_eq!(late.presentation_sof(1_000_000), Some(2048 + 15 - 40));
+        assert_eq!(times(48_000_000, Some((48_047_000, 7))).presentation_sof(48_000_000), Some(6));
+        assert_eq!(times(0, Some((3_000_000, 7))).presentation_sof(1_000_000), None);
+        assert_eq!(times(0, None).presentation_sof(1_000_000), None);
     }
 
     #[test]

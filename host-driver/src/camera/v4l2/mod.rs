@@ -18,7 +18,7 @@ use super::{CameraError, CameraFrame, CameraSource, fingerprint};
 use crate::clock::Clock;
 use crate::sync::{FrameStamp, Side};
 use ioctl::PixelLayout;
-use metadata::TickClock;
+use metadata::{HeaderTimes, TickClock};
 use node::{Dequeued, Node, NodeKind};
 use pixels::PixelFormat;
 use std::collections::VecDeque;
@@ -68,8 +68,9 @@ struct Stream {
     format: PixelFormat,
     layout: PixelLayout,
     ticks: TickClock,
-    /// Presentation times by sequence number.
-    times: VecDeque<(u32, u32)>,
+    clock_hz: u32,
+    /// Times of pictures by sequence number.
+    times: VecDeque<(u32, HeaderTimes)>,
     pictures: VecDeque<Dequeued>,
 }
 
@@ -79,16 +80,19 @@ pub struct V4l2Cameras {
     clock: Arc<dyn Clock>,
     ready: VecDeque<CameraFrame>,
     damaged: [u64; 2],
+    shares_bus: bool,
 }
 
 impl V4l2Cameras {
-    /// Opens and configures the cameras of a sensor.
+    /// Opens and configures the cameras of a sensor. `shares_bus`: they are on the control interface's
+    /// USB bus, so that frame numbers of that bus tie their pictures to its triggers.
     ///
     /// # Errors
     /// Names the camera: no permission, in use by another program, no grey format, another size.
     pub fn open(
         cameras: &SensorCameras,
         settings: &CameraSettings,
+        shares_bus: bool,
         clock: Arc<dyn Clock>,
     ) -> Result<Self, CameraError> {
         let streams = match cameras {
@@ -100,12 +104,7 @@ impl V4l2Cameras {
                 vec![Stream::open(both, vec![Side::Left, Side::Right], settings)?]
             }
         };
-        Ok(Self { streams, clock, ready: VecDeque::new(), damaged: [0; 2] })
-    }
-
-    /// Pictures of the left and right camera that arrived damaged and were dropped.
-    pub fn damaged(&self) -> [u64; 2] {
-        self.damaged
+        Ok(Self { streams, clock, ready: VecDeque::new(), damaged: [0; 2], shares_bus })
     }
 
     fn collect(&mut self) -> Result<(), CameraError> {
@@ -113,7 +112,7 @@ impl V4l2Cameras {
         for stream in &mut self.streams {
             let side = stream.sides[0];
             stream.fetch().map_err(|e| gone_or_io(side, e))?;
-            while let Some((picture, timestamp_camera_ns)) = stream.complete() {
+            while let Some((picture, timestamp_camera_ns, usb_sof)) = stream.complete() {
                 let frames = stream.frames(&picture);
                 if picture.is_damaged || frames.iter().any(Option::is_none) {
                     for side in &stream.sides {
@@ -128,6 +127,7 @@ impl V4l2Cameras {
                         timestamp_camera_ns,
                         arrival_host_ns,
                         fingerprint: fingerprint(&image),
+                        usb_sof: usb_sof.filter(|_| self.shares_bus),
                     };
                     self.ready.push_back(CameraFrame { stamp, image });
                 }
@@ -138,6 +138,10 @@ impl V4l2Cameras {
 }
 
 impl CameraSource for V4l2Cameras {
+    fn damaged(&self) -> [u64; 2] {
+        self.damaged
+    }
+
     fn start(&mut self) -> Result<(), CameraError> {
         self.ready.clear();
         for stream in &mut self.streams {
@@ -213,7 +217,8 @@ impl Stream {
         if layout.pixel_format != format.fourcc() {
             return Err(CameraError::NoGreyFormat { side, path: video.path().into() });
         }
-        let ticks = TickClock::new(camera.clock_hz.unwrap_or(1));
+        let clock_hz = camera.clock_hz.unwrap_or(1);
+        let ticks = TickClock::new(clock_hz);
         let mut stream = Self {
             sides,
             video,
@@ -221,6 +226,7 @@ impl Stream {
             format,
             layout,
             ticks,
+            clock_hz,
             times: VecDeque::new(),
             pictures: VecDeque::new(),
         };
@@ -280,7 +286,7 @@ impl Stream {
         if let Some(metadata) = &mut self.metadata {
             while let Some(buffer) = metadata.take()? {
                 if let Some(times) = metadata::parse(&buffer.bytes) {
-                    self.times.push_back((buffer.sequence, times.presentation_ticks));
+                    self.times.push_back((buffer.sequence, times));
                 }
             }
             while self.times.len() > 2 * BUFFERS as usize {
@@ -293,27 +299,29 @@ impl Stream {
         Ok(())
     }
 
-    /// The oldest picture and its camera time, once its metadata is there or will not come.
-    fn complete(&mut self) -> Option<(Dequeued, u64)> {
+    /// The oldest picture with its camera time and the USB frame number of its exposure's start, once
+    /// its metadata is there or will not come.
+    fn complete(&mut self) -> Option<(Dequeued, u64, Option<u16>)> {
         let first = self.pictures.front()?;
         if self.metadata.is_none() {
             let picture = self.pictures.pop_front()?;
             let timestamp_ns = picture.timestamp_ns;
-            return Some((picture, timestamp_ns));
+            return Some((picture, timestamp_ns, None));
         }
         let sequence = first.sequence;
         match self.times.iter().position(|(of, _)| *of == sequence) {
             Some(at) => {
-                let (_, ticks) = self.times.remove(at)?;
-                let timestamp_ns = self.ticks.nanoseconds(ticks);
-                Some((self.pictures.pop_front()?, timestamp_ns))
+                let (_, times) = self.times.remove(at)?;
+                let timestamp_ns = self.ticks.nanoseconds(times.presentation_ticks);
+                let usb_sof = times.presentation_sof(self.clock_hz);
+                Some((self.pictures.pop_front()?, timestamp_ns, usb_sof))
             }
             // A time of another clock would mislead the pairing: without its own time a picture is
             // damaged.
             None if self.pictures.len() > AWAITING_METADATA => {
                 let mut picture = self.pictures.pop_front()?;
                 picture.is_damaged = true;
-                Some((picture, 0))
+                Some((picture, 0, None))
             }
             None => None,
         }

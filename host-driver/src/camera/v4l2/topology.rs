@@ -89,9 +89,9 @@ pub enum SensorCameras {
 
 /// The cameras that hang nearest to the control interface at `control_usb_path`.
 ///
-/// A sensor has a hub inside, so that its parts share all ports but the last. Of two cameras the one
-/// that says "left" or "right" in its product string is that; otherwise the lower port is left. A
-/// single camera is taken for one that delivers both pictures.
+/// A sensor has a hub inside, so that its parts share all ports but the last. One camera that says
+/// "left" in its product string and one that says "right" are that, whatever else is there; otherwise,
+/// of two cameras, the lower port is left. A single camera is taken for one that delivers both pictures.
 ///
 /// # Errors
 /// The number of cameras found, when that is neither one nor two.
@@ -106,11 +106,14 @@ pub fn cameras_of(
         }
         None => cameras.iter().collect(),
     };
+    let says = |camera: &UsbCamera, side: &str| camera.product.to_ascii_lowercase().contains(side);
+    let named = |side| -> Vec<_> { near.iter().filter(|camera| says(camera, side)).collect() };
+    if let ([left], [right]) = (named("left").as_slice(), named("right").as_slice()) {
+        return Ok(SensorCameras::Two { left: (**left).clone(), right: (**right).clone() });
+    }
     match near.as_slice() {
         [one] => Ok(SensorCameras::SideBySide((*one).clone())),
         [a, b] => {
-            let says =
-                |camera: &UsbCamera, side: &str| camera.product.to_ascii_lowercase().contains(side);
             let swapped = says(a, "right") || says(b, "left");
             let (left, right) = if swapped { (b, a) } else { (a, b) };
             Ok(SensorCameras::Two { left: (*left).clone(), right: (*right).clone() })
@@ -164,6 +167,13 @@ mod tests {
         let all = [camera("1-1", "Right IR"), camera("1-2", "Left IR")];
         let found = cameras_of(Some("1-3"), &all).unwrap();
         assert_eq!(found, SensorCameras::Two { left: all[1].clone(), right: all[0].clone() });
+    }
+
+    #[test]
+    fn a_webcam_beside_named_cameras_is_left_out() {
+        let all = [camera("1-1", "Webcam"), camera("1-2", "IR left"), camera("1-4", "IR right")];
+        let found = cameras_of(Some("1-3"), &all).unwrap();
+        assert_eq!(found, SensorCameras::Two { left: all[1].clone(), right: all[2].clone() });
     }
 
     #[test]

@@ -1,0 +1,235 @@
+//! A simulated camera's pictures for its USB device.
+//!
+//! Two full-size cameras at 30 Hz are more than a small machine can render. A still scene under the
+//! same light makes the same picture but for the sensor's noise, so pictures are kept: for each light
+//! and exposure a few with noise of their own, out of whose rows every frame is put together anew. No
+//! two frames are equal, and each pixel's noise is a real draw. A moving scene is rendered frame by
+//! frame, as fast as that goes.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::bench::Bench;
+use super::uvc::payload::CLOCK_HZ;
+use super::uvc::{Frame, FrameSource, Settings};
+use crate::rig::Exposure;
+use crate::world::{Camera, LightInterval, LightSource, RawImage, World};
+
+/// Pictures with noise of their own that are kept for one light and exposure.
+const VARIANTS: usize = 4;
+
+/// Lights and exposures of which pictures are kept: two timings' worth for each camera.
+const KEYS: usize = 64;
+
+/// What a picture of a still scene depends on, besides noise.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Key {
+    camera: Camera,
+    exposure_us: u64,
+    gain_percent: u32,
+    /// Each light's time within the exposure, microseconds.
+    lights_us: Vec<(LightSource, u64)>,
+}
+
+impl Key {
+    fn of(exposure: &Exposure, gain_percent: u32) -> Self {
+        // The chip's edges jitter by less than the microsecond that is kept.
+        let us = |ns: u64| (ns + 500) / 1000;
+        let mut lights_us: Vec<_> = exposure
+            .lights
+            .iter()
+            .map(|light| {
+                let (on, off) =
+                    (light.on_ns.max(exposure.open_ns), light.off_ns.min(exposure.close_ns));
+                (light.source, us(off.saturating_sub(on)))
+            })
+            .filter(|(_, lit_us)| *lit_us > 0)
+            .collect();
+        lights_us.sort_unstable();
+        let exposure_us = us(exposure.close_ns - exposure.open_ns);
+        Self { camera: exposure.camera, exposure_us, gain_percent, lights_us }
+    }
+
+    fn render(&self, world: &World, seed: u64) -> RawImage {
+        let lights: Vec<_> = self
+            .lights_us
+            .iter()
+            .map(|&(source, us)| LightInterval { source, on_ns: 0, off_ns: us * 1000 })
+            .collect();
+        let gain = f64::from(self.gain_percent) / 100.0;
+        world.expose_with_gain(self.camera, 0, self.exposure_us * 1000, &lights, gain, seed)
+    }
+}
+
+/// Pictures of a scene, kept where it stands still.
+pub struct FrameBank {
+    world: Arc<World>,
+    kept: Mutex<BTreeMap<Key, Vec<Arc<RawImage>>>>,
+}
+
+impl FrameBank {
+    /// An empty bank.
+    #[must_use]
+    pub fn new(world: Arc<World>) -> Self {
+        Self { world, kept: Mutex::default() }
+    }
+
+    /// Makes all pictures of an exposure beforehand, where the scene stands still.
+    pub fn prepare(&self, exposure: &Exposure, gain_percent: u32) {
+        if self.world.is_still() {
+            let key = Key::of(exposure, gain_percent);
+            while self.variants(&key, 0).len() < VARIANTS {}
+        }
+    }
+
+    /// The picture of an exposure.
+    #[must_use]
+    pub fn picture(&self, exposure: &Exposure, gain_percent: u32) -> RawImage {
+        let Exposure { camera, open_ns, close_ns, lights, .. } = exposure;
+        if !self.world.is_still() {
+            let gain = f64::from(gain_percent) / 100.0;
+            return self
+                .world
+                .expose_with_gain(*camera, *open_ns, *close_ns, lights, gain, *open_ns);
+        }
+        let variants = self.variants(&Key::of(exposure, gain_percent), *open_ns);
+        let first = &variants[0];
+        let mut data = Vec::with_capacity(first.data.len());
+        // SplitMix64 over the exposure's time and the row.
+        let mut state = *open_ns;
+        for row in 0..first.height {
+            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+            let mut bits = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+            let variant = &variants[((bits >> 40) % variants.len() as u64) as usize];
+            data.extend_from_slice(&variant.data[row * first.width..][..first.width]);
+        }
+        RawImage { width: first.width, height: first.height, bits: first.bits, data }
+    }
+
+    /// The pictures that are there, after one more was made unless there are enough.
+    fn variants(&self, key: &Key, seed: u64) -> Vec<Arc<RawImage>> {
+        let known = |kept: &BTreeMap<Key, Vec<Arc<RawImage>>>| kept.get(key).cloned();
+        let mut variants = known(&self.lock()).unwrap_or_default();
+        if variants.len() < VARIANTS {
+            // Rendered without the lock: the other camera goes on.
+            let seed = seed.wrapping_mul(VARIANTS as u64).wrapping_add(variants.len() as u64);
+            variants.push(Arc::new(key.render(&self.world, seed)));
+            let mut kept = self.lock();
+            if kept.len() >= KEYS && !kept.contains_key(key) {
+                kept.clear();
+            }
+            kept.insert(key.clone(), variants.clone());
+        }
+        variants
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<Key, Vec<Arc<RawImage>>>> {
+        // Entries are put in whole.
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// What happens to one of a camera's frames on its way, for tests of hosts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FrameFault {
+    /// It is never sent; the camera's time goes on.
+    Lost,
+    /// It is sent twice.
+    Duplicated,
+    /// From now on every frame is sent one later than it should be.
+    Lagging,
+    /// Half of it is missing.
+    Short,
+}
+
+/// One of the sensor's cameras.
+pub struct Eye {
+    bench: Arc<Bench>,
+    bank: Arc<FrameBank>,
+    camera: Camera,
+    /// The camera's clock against the sensor's: offset in nanoseconds, drift in millionths.
+    clock: (u64, i64),
+    faults: Arc<Mutex<Vec<FrameFault>>>,
+    again: Option<Frame>,
+    lagging: Option<Frame>,
+    lags: bool,
+}
+
+impl Eye {
+    /// The camera of the sensor on `bench` before the scene of `bank`.
+    #[must_use]
+    pub fn new(bench: Arc<Bench>, bank: Arc<FrameBank>, camera: Camera) -> Self {
+        let clock = match camera {
+            Camera::Left => (41_234_567_891, 37),
+            Camera::Right => (7_345_678_912, -52),
+        };
+        let faults = Arc::default();
+        Self { bench, bank, camera, clock, faults, again: None, lagging: None, lags: false }
+    }
+
+    /// Faults to come, the next frame's last.
+    #[must_use]
+    pub fn faults(&self) -> Arc<Mutex<Vec<FrameFault>>> {
+        Arc::clone(&self.faults)
+    }
+
+    fn ticks(&self, time_ns: u64) -> u32 {
+        let (offset_ns, drift_ppm) = self.clock;
+        let drift_ns = i128::from(time_ns) * i128::from(drift_ppm) / 1_000_000;
+        let camera_ns = i128::from(offset_ns) + i128::from(time_ns) + drift_ns;
+        (camera_ns * i128::from(CLOCK_HZ) / 1_000_000_000) as u32
+    }
+
+    fn take(&mut self, settings: Settings) -> Option<Frame> {
+        let exposure = {
+            let mut rig = self.bench.rig();
+            let longest_ns = u64::from(settings.exposure_us) * 1000;
+            rig.set_longest_exposure_ns(self.camera, Some(longest_ns));
+            rig.take_ready(self.camera)?
+        };
+        let picture = self.bank.picture(&exposure, settings.gain_percent);
+        let pixels = if picture.bits <= 8 {
+            picture.data.iter().map(|&v| v as u8).collect()
+        } else {
+            picture.data.iter().flat_map(|v| v.to_le_bytes()).collect()
+        };
+        let sof = self.bench.frame_number(exposure.open_ns);
+        Some(Frame { pixels, exposure_ticks: self.ticks(exposure.open_ns), sof })
+    }
+}
+
+impl FrameSource for Eye {
+    fn start(&mut self) {
+        (self.again, self.lagging, self.lags) = (None, None, false);
+        self.bench.rig().start_camera(self.camera);
+    }
+
+    fn stop(&mut self) {
+        self.bench.rig().stop_camera(self.camera);
+    }
+
+    fn poll(&mut self, settings: Settings) -> Option<Frame> {
+        if let Some(again) = self.again.take() {
+            return Some(again);
+        }
+        let mut frame = self.take(settings)?;
+        let fault = self.faults.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        match fault {
+            Some(FrameFault::Lost) => return None,
+            Some(FrameFault::Duplicated) => self.again = Some(frame.clone()),
+            Some(FrameFault::Lagging) => self.lags = true,
+            Some(FrameFault::Short) => frame.pixels.truncate(frame.pixels.len() / 2),
+            None => {}
+        }
+        if self.lags {
+            return self.lagging.replace(frame);
+        }
+        Some(frame)
+    }
+
+    fn clock(&self) -> (u32, u16) {
+        let now_ns = self.bench.rig().now_ns();
+        (self.ticks(now_ns), self.bench.frame_number(now_ns))
+    }
+}
