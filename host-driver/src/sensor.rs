@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use serde::Serialize;
-use stspp_protocol::fault::FaultReport;
+use stspp_protocol::fault::{FaultReason, FaultReport};
 use stspp_protocol::reply::{RequestError, Status};
 use stspp_protocol::request::{
     ClearFaults, FloodlightOff, FloodlightOn, GetFaults, GetStatus, GetTiming, GetTriggerSource,
@@ -204,6 +204,18 @@ impl Sensor {
         }
     }
 
+    /// Whether a stream could start now: starts the cameras, without light, and stops them again.
+    ///
+    /// # Errors
+    /// Which camera is missing, busy or not what the calibration says; while a stream is running.
+    pub fn try_start(&self) -> Result<(), Error> {
+        let session = self.session("start cameras")?;
+        let _lease = Lease::take(&self.streaming).ok_or(Error::Streaming)?;
+        let started = session.cameras().start();
+        session.cameras().stop();
+        Ok(started?)
+    }
+
     /// Opens the control link again after the sensor was unplugged, restarted or given up: waits up to
     /// `timeout` for it to be there. Streams can be started again then; cameras are opened at their
     /// start anyway.
@@ -222,6 +234,12 @@ impl Sensor {
             link.replace(reopen(timeout)?);
         }
         let found = link.hello()?;
+        // What latched because this host was away is told by the error that the caller has had.
+        let latched = link.call(&GetStatus)?.latched;
+        let by_absence = [FaultReason::HeartbeatLost, FaultReason::LinkLost];
+        if !latched.is_empty() && latched.iter().all(|reason| by_absence.contains(&reason)) {
+            link.call(&ClearFaults)?;
+        }
         if found.serial != device.serial {
             let (expected, got) = (device.serial.to_string(), found.serial.to_string());
             return Err(Error::OtherSensor { expected, got });

@@ -14,6 +14,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("stspp-hil-sim", &["stspp-protocol", "stspp-firmware-logic"]),
     ("stspp-hil-mcu", &["stspp-protocol", "stspp-firmware-logic", "stspp-hil-sim"]),
     ("stspp", &["stspp-protocol", "stspp-matcher", "stspp-hil-sim", "stspp-hil-mcu"]),
+    ("stspp-hil-serve", &["stspp-protocol", "stspp-hil-sim", "stspp-hil-mcu"]),
     ("stspp-e2e-guest", &[]),
     ("xtask", &[]),
 ];

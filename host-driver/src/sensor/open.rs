@@ -90,7 +90,8 @@ impl LiveOptions {
         }
     }
 
-    fn choice(&self) -> CameraChoice {
+    /// Which cameras are meant.
+    pub fn choice(&self) -> CameraChoice {
         match (&self.left, &self.right, &self.both) {
             (Some(left), Some(right), _) => {
                 CameraChoice::Nodes { left: left.clone(), right: right.clone() }

@@ -7,6 +7,8 @@ mod check;
 mod completions;
 #[cfg(feature = "sim")]
 mod demo;
+#[cfg(target_os = "linux")]
+mod doctor;
 #[allow(dead_code, reason = "the table of exit codes is whole, whoever uses it")]
 mod exit;
 mod frame_report;
@@ -46,6 +48,8 @@ struct Cli {
 enum Verb {
     List(list::Args),
     Info(info::Args),
+    #[cfg(target_os = "linux")]
+    Doctor(doctor::Args),
     #[cfg(feature = "sim")]
     Demo(demo::Args),
     Reconstruct(reconstruct::Args),
@@ -67,6 +71,8 @@ fn main() -> ExitCode {
     let result: Result<(), Failure> = match cli.verb {
         Verb::List(args) => list::run(&args, &output),
         Verb::Info(args) => info::run(&args, &output),
+        #[cfg(target_os = "linux")]
+        Verb::Doctor(args) => doctor::run(&args, &output),
         #[cfg(feature = "sim")]
         Verb::Demo(args) => demo::run(&args, &output),
         Verb::Reconstruct(args) => reconstruct::run(&args, &output),

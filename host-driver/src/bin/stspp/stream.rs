@@ -1,9 +1,10 @@
 //! `stspp stream` and `stspp play`: depth frames with live statistics.
 
 use std::path::PathBuf;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use serde_json::json;
+use stspp::error::{Missing, Timeout};
 use stspp::report::Summary;
 use stspp::{DepthStream, Error, Sensor, StreamStats};
 
@@ -23,6 +24,12 @@ pub struct Args {
     /// Depth frames to stream [default: until Ctrl-C].
     #[arg(long, short = 'n', value_name = "N")]
     count: Option<u64>,
+    /// Raw labelled pairs without matching: shows what cable, cameras and triggers do.
+    #[arg(long)]
+    pairs: bool,
+    /// When the sensor is unplugged or restarts, wait so long for it and go on.
+    #[arg(long, value_name = "SECONDS")]
+    reconnect: Option<f64>,
     #[command(flatten)]
     matching: Matching,
 }
@@ -41,25 +48,151 @@ pub struct PlayArgs {
 
 /// Runs `stream`.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
-    let sensor = args.source.open()?;
-    show(sensor, &args.matching, args.count, output)
+    let mut sensor = args.source.open()?;
+    let wait = match args.reconnect {
+        Some(seconds) => Duration::try_from_secs_f64(seconds).ok(),
+        None => Some(Duration::ZERO),
+    };
+    let Some(wait) = wait else {
+        return Err(Failure::new(Kind::Usage, "--reconnect: expected a number of seconds"));
+    };
+    let mut shown = 0;
+    loop {
+        let left = args.count.map(|count| count - shown);
+        let outcome = if args.pairs {
+            pairs(&mut sensor, left, &mut shown, output)
+        } else {
+            show(&mut sensor, &args.matching, left, &mut shown, output)
+        };
+        let Err(End::Lost(error)) = outcome else { return outcome.map_err(End::into_failure) };
+        if wait.is_zero() {
+            return Err(failure(&error));
+        }
+        eprintln!("warning: {error}; waiting for the sensor");
+        resume(&mut sensor, wait)?;
+    }
+}
+
+/// How a stream ended early.
+enum End {
+    /// It can be started again once the sensor is back.
+    Lost(Error),
+    Failed(Failure),
+}
+
+impl End {
+    fn of(error: Error) -> Self {
+        match error {
+            Error::Transport(_) | Error::Camera(_) | Error::DeviceReset(_) => Self::Lost(error),
+            Error::Timeout(Timeout { missing: Missing::Reply { .. }, .. }) => Self::Lost(error),
+            other => Self::Failed(failure(&other)),
+        }
+    }
+
+    fn into_failure(self) -> Failure {
+        match self {
+            Self::Lost(error) => failure(&error),
+            Self::Failed(failure) => failure,
+        }
+    }
+}
+
+impl From<Failure> for End {
+    fn from(failure: Failure) -> Self {
+        Self::Failed(failure)
+    }
+}
+
+/// Waits up to `wait` until the sensor and its cameras are there again.
+fn resume(sensor: &mut Sensor, wait: Duration) -> Result<(), Failure> {
+    let deadline = Instant::now() + wait;
+    loop {
+        let left = deadline.saturating_duration_since(Instant::now());
+        // A camera that is still missing shows when the stream is started.
+        let back = sensor.reconnect(left).and_then(|()| sensor.try_start());
+        interrupt::check()?;
+        match back {
+            Ok(()) => return Ok(()),
+            Err(error) if left.is_zero() => return Err(failure(&error)),
+            Err(_) => std::thread::sleep(Duration::from_millis(200)),
+        }
+    }
+}
+
+/// Shows raw pairs.
+fn pairs(
+    sensor: &mut Sensor,
+    count: Option<u64>,
+    shown: &mut u64,
+    output: &Output,
+) -> Result<(), End> {
+    let mut stream = sensor.pairs(&stspp::StreamOptions::default()).map_err(End::of)?;
+    interrupt::stops(stream.stop_handle());
+    let live = output.spinner();
+    let begun = Instant::now();
+    let mut result = Ok(());
+    let mut here = 0;
+    while count.is_none_or(|count| here < count) {
+        let Some(pair) = stream.next() else { break };
+        if interrupt::check().is_err() {
+            break;
+        }
+        let pair = match pair {
+            Ok(pair) => pair,
+            Err(error @ Error::Timeout(Timeout { missing: Missing::Reply { .. }, .. })) => {
+                result = Err(End::of(error));
+                break;
+            }
+            Err(error @ Error::Timeout(_)) if count.is_none() => {
+                live.println(format!("warning: {error}"));
+                continue;
+            }
+            Err(error) => {
+                result = Err(End::of(error));
+                break;
+            }
+        };
+        here += 1;
+        *shown += 1;
+        if output.json {
+            let delay_ms = pair.arrival_delay.as_secs_f64() * 1e3;
+            println!("{}", json!({ "label": pair.label, "arrival_delay_ms": delay_ms }));
+        } else {
+            let stats = stream.stats();
+            live.set_message(format!(
+                "pair {}: slot {}, {:.1} pairs/s, {:.1} ms after its exposure, lost {}",
+                pair.label.sequence,
+                pair.label.slot,
+                here as f64 / begun.elapsed().as_secs_f64(),
+                pair.arrival_delay.as_secs_f64() * 1e3,
+                lost(&stats),
+            ));
+        }
+    }
+    live.finish_and_clear();
+    let stats = stream.finish();
+    summary(&stats, begun.elapsed().as_secs_f64(), output);
+    result?;
+    interrupt::check().or_else(|e| if count.is_none() { Ok(()) } else { Err(e) })?;
+    Ok(())
 }
 
 /// Runs `play`.
 pub fn play(args: &PlayArgs, output: &Output) -> Result<(), Failure> {
     let source = stspp::SourceUri::Replay { folder: args.folder.clone(), options: Vec::new() };
-    let sensor = Sensor::open_uri(&source).map_err(|e| failure(&e))?;
-    show(sensor, &args.matching, args.count, output)
+    let mut sensor = Sensor::open_uri(&source).map_err(|e| failure(&e))?;
+    show(&mut sensor, &args.matching, args.count, &mut 0, output).map_err(End::into_failure)
 }
 
 fn show(
-    mut sensor: Sensor,
+    sensor: &mut Sensor,
     matching: &Matching,
     count: Option<u64>,
+    shown: &mut u64,
     output: &Output,
-) -> Result<(), Failure> {
+) -> Result<(), End> {
     let options = stream_options(matching);
-    let mut stream = sensor.stream_with(&options).map_err(|e| failure(&e))?;
+    let mut stream = sensor.stream_with(&options).map_err(End::of)?;
     interrupt::stops(stream.stop_handle());
     let live = output.spinner();
     let begun = Instant::now();
@@ -70,13 +203,14 @@ fn show(
     // The light is off before anything else is said.
     drop(stream);
     summary(&stats, begun.elapsed().as_secs_f64(), output);
+    *shown += frames;
     result?;
     if frames == 0 {
         let what = format!(
             "no depth frame: {} pairs, {} gaps, {} mislabelled; a window needs consecutive slots",
             stats.pairs, stats.window_gaps, stats.pairs_mislabelled
         );
-        return Err(Failure::new(Kind::Input, what));
+        return Err(Failure::new(Kind::Input, what).into());
     }
     Ok(())
 }
@@ -87,20 +221,22 @@ fn follow(
     frames: &mut u64,
     output: &Output,
     live: &indicatif::ProgressBar,
-) -> Result<(), Failure> {
+) -> Result<(), End> {
     while count.is_none_or(|count| *frames < count) {
         let Some(frame) = stream.next() else { break };
         // Ctrl-C is the way to end a stream without a count.
         if interrupt::check().is_err() {
-            return if count.is_none() { Ok(()) } else { interrupt::check() };
+            return if count.is_none() { Ok(()) } else { Ok(interrupt::check()?) };
         }
         let frame = match frame {
             Ok(frame) => frame,
-            Err(error @ Error::Timeout(_)) if count.is_none() => {
+            Err(error @ Error::Timeout(timeout))
+                if count.is_none() && !matches!(timeout.missing, Missing::Reply { .. }) =>
+            {
                 live.println(format!("warning: {error}"));
                 continue;
             }
-            Err(error) => return Err(failure(&error)),
+            Err(error) => return Err(End::of(error)),
         };
         *frames += 1;
         let stats = stream.stats();
@@ -119,7 +255,8 @@ fn follow(
             live.set_message(live_line(&frame, &summary, &stats));
         }
     }
-    interrupt::check().or_else(|failure| if count.is_none() { Ok(()) } else { Err(failure) })
+    interrupt::check().or_else(|e| if count.is_none() { Ok(()) } else { Err(e) })?;
+    Ok(())
 }
 
 fn live_line(frame: &stspp::DepthFrame, summary: &Summary, stats: &StreamStats) -> String {
@@ -151,7 +288,7 @@ fn summary(stats: &StreamStats, wall_s: f64, output: &Output) {
     println!(
         "{} depth frames in {wall_s:.1} s ({:.2} frames/s), latency {:.0} ms from the last exposure's end\n\
          triggers  {}, events lost {}, ignored {}\n\
-         frames    left {}, right {}; pairs {}, windows {}, gaps {}\n\
+         frames    left {}, right {}, damaged {}; pairs {}, windows {}, gaps {}\n\
          rejected  {} duplicate, {} late, {} without trigger, {} mislabelled, {} without partner, \
          {} unsynchronised, {} on their way at the end\n\
          dropped   {} frames, {} pairs, {} windows skipped, {} depth frames not fetched",
@@ -163,6 +300,7 @@ fn summary(stats: &StreamStats, wall_s: f64, output: &Output) {
         stats.events_ignored,
         stats.frames_left,
         stats.frames_right,
+        stats.damaged_left + stats.damaged_right,
         stats.pairs,
         stats.windows,
         stats.window_gaps,

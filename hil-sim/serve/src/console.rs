@@ -1,0 +1,106 @@
+//! What the user of the simulated sensor can do to it, a line each.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use stspp_hil_mcu::front::SharedController;
+use stspp_hil_mcu::soc::peripheral::ResetCause;
+use stspp_hil_sim::device::Controller;
+use stspp_hil_sim::front::bench::Bench;
+use stspp_hil_sim::front::eyes::FrameFault;
+use stspp_hil_sim::front::plug::Cable;
+
+const HELP: &str = "unplug control|left|right, plug control|left|right, \
+                    fault left|right lost|duplicated|lagging|short, interlock open|closed, \
+                    hang, reset, status";
+
+/// The controller's inputs.
+pub enum Chip {
+    /// The emulated chip.
+    Emulated(SharedController),
+    /// The firmware's logic in process.
+    InProcess(Arc<Bench>),
+}
+
+/// Faults to come of one camera.
+type Faults = Arc<Mutex<Vec<FrameFault>>>;
+
+/// Cables, cameras and controller of the sensor.
+pub struct Console {
+    cables: [Cable; 3],
+    faults: Vec<Faults>,
+    chip: Chip,
+}
+
+impl Console {
+    /// Of the cables of control, left and right, and both cameras' faults.
+    pub fn new(cables: [Cable; 3], faults: Vec<Faults>, chip: Chip) -> Self {
+        Self { cables, faults, chip }
+    }
+
+    /// Carries out a command; says what came of it, `ok` first when it was one.
+    pub fn command(&self, line: &str) -> String {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let done = match words.as_slice() {
+            ["unplug", device] => self.plug(device, false),
+            ["plug", device] => self.plug(device, true),
+            ["fault", camera, fault] => self.fault(camera, fault),
+            ["interlock", "open"] => self.with_controller(|c| c.set_interlock_closed(false)),
+            ["interlock", "closed"] => self.with_controller(|c| c.set_interlock_closed(true)),
+            ["hang"] => self.with_chip(|chip| chip.hang()),
+            ["reset"] => self.with_chip(|chip| chip.reset(ResetCause::Pin)),
+            ["status"] => return format!("ok {}", self.status()),
+            _ => None,
+        };
+        match done {
+            Some(()) => "ok".into(),
+            None => format!("not understood; commands: {HELP}"),
+        }
+    }
+
+    fn plug(&self, device: &str, plugged: bool) -> Option<()> {
+        let at = ["control", "left", "right"].iter().position(|known| *known == device)?;
+        self.cables[at].set_plugged(plugged);
+        Some(())
+    }
+
+    fn fault(&self, camera: &str, fault: &str) -> Option<()> {
+        let at = ["left", "right"].iter().position(|known| *known == camera)?;
+        let fault = match fault {
+            "lost" => FrameFault::Lost,
+            "duplicated" => FrameFault::Duplicated,
+            "lagging" => FrameFault::Lagging,
+            "short" => FrameFault::Short,
+            _ => return None,
+        };
+        self.faults[at].lock().unwrap_or_else(PoisonError::into_inner).push(fault);
+        Some(())
+    }
+
+    fn with_controller(&self, act: impl FnOnce(&mut dyn Controller)) -> Option<()> {
+        match &self.chip {
+            Chip::Emulated(shared) => act(&mut shared.clone()),
+            Chip::InProcess(bench) => act(bench.rig().controller()),
+        }
+        Some(())
+    }
+
+    /// Only a chip can hang or be reset by its pin.
+    fn with_chip(&self, act: impl FnOnce(&mut stspp_hil_mcu::chip::Chip)) -> Option<()> {
+        match &self.chip {
+            Chip::Emulated(shared) => {
+                act(shared.lock().chip());
+                Some(())
+            }
+            Chip::InProcess(_) => None,
+        }
+    }
+
+    fn status(&self) -> String {
+        let lit = match &self.chip {
+            Chip::Emulated(shared) => shared.lock().light_is_on(),
+            Chip::InProcess(bench) => !bench.rig().lit().is_empty(),
+        };
+        let plugged: Vec<bool> = self.cables.iter().map(Cable::is_plugged).collect();
+        format!("lit={lit} plugged={plugged:?}")
+    }
+}

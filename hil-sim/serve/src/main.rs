@@ -1,0 +1,117 @@
+//! `hil-sim serve --usbip`: the simulated sensor as USB devices that a Linux machine attaches.
+//!
+//! [`sensor`] puts controller, light, cameras and USB devices together; [`console`] lets its user pull
+//! cables and inject faults; [`calibration`] writes what a host needs to know of the cameras.
+
+mod calibration;
+mod console;
+mod sensor;
+
+use std::io::{BufRead, Write};
+use std::net::TcpListener;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::atomic::Ordering;
+
+use clap::{Parser, Subcommand, ValueEnum};
+
+/// The simulated stspp sensor for other programs.
+#[derive(Parser)]
+#[command(name = "hil-sim", version)]
+struct Cli {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Subcommand)]
+enum Verb {
+    Serve(Serve),
+}
+
+/// Offer the sensor to a Linux machine as USB devices: `modprobe vhci-hcd`, then `usbip attach -r HOST
+/// -b 1-1`, `1-2` and `1-3`.
+///
+/// Commands on standard input pull cables and inject faults (`help` lists them).
+#[derive(clap::Args)]
+pub struct Serve {
+    /// By USB/IP, the only way there is.
+    #[arg(long, required = true)]
+    usbip: bool,
+    /// Address to listen at; port 0 takes a free one.
+    #[arg(long, default_value = "127.0.0.1:3240", value_name = "ADDRESS:PORT")]
+    listen: String,
+    /// Scene before the cameras: a name of `stspp list --scenes` or a mesh file, with
+    /// `?OPTION=VALUE&...`.
+    #[arg(long, default_value = "sphere")]
+    scene: String,
+    /// Dot layouts, tolerances and noise.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Cameras with 1/SCALE of the pixels in each direction: 1, 2, 4, 8 or 16.
+    #[arg(long, default_value_t = 1)]
+    scale: usize,
+    /// Bits of a pixel: 8 as GREY, 10 or 12 as Y16.
+    #[arg(long, default_value_t = 8)]
+    bits: u8,
+    /// What runs the controller.
+    #[arg(long, value_enum, default_value_t = Mcu::F350)]
+    mcu: Mcu,
+    /// The firmware's ELF [default: that of `cargo xtask firmware`].
+    #[arg(long, value_name = "FILE")]
+    firmware: Option<PathBuf>,
+    /// Write the cameras' calibration (camchain.yaml) here and go on.
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
+}
+
+/// What runs the simulated controller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Mcu {
+    /// The firmware's binary on an emulated GD32F350, with its own USB device.
+    F350,
+    /// The firmware's logic in this process, behind a USB device with the same descriptors.
+    None,
+}
+
+fn main() -> ExitCode {
+    let Verb::Serve(serve) = Cli::parse().verb;
+    match run(&serve) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(serve: &Serve) -> Result<(), Box<dyn std::error::Error>> {
+    let listener = TcpListener::bind(&serve.listen)
+        .map_err(|error| format!("{}: {error}; choose another port by --listen", serve.listen))?;
+    let address = listener.local_addr()?;
+    let sensor = sensor::Sensor::new(serve)?;
+    if let Some(path) = &serve.calibration {
+        let text = calibration::to_text(sensor.world().model());
+        std::fs::write(path, text).map_err(|error| format!("{}: {error}", path.display()))?;
+    }
+    eprintln!("rendering {} as each light shows it", serve.scene);
+    sensor.prepare();
+    let (server, console) = sensor.into_server();
+    // The first line of the output is for programs.
+    println!("{}", address.port());
+    std::io::stdout().flush()?;
+    eprintln!("control interface 1-1, left camera 1-2, right camera 1-3 at {address}");
+    for bus_id in ["1-1", "1-2", "1-3"] {
+        eprintln!("  usbip --tcp-port {} attach -r {} -b {bus_id}", address.port(), address.ip());
+    }
+    let stop = server.stop_flag();
+    std::thread::Builder::new().name("console".into()).spawn(move || {
+        for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+            println!("{}", console.command(&line));
+            let _ = std::io::stdout().flush();
+        }
+        // Whoever started this is gone, or wants it to end.
+        stop.store(true, Ordering::Relaxed);
+    })?;
+    server.listen(&listener, |said| eprintln!("{said}"))?;
+    Ok(())
+}

@@ -1,0 +1,184 @@
+//! The simulated sensor as three USB devices: control interface, left camera, right camera.
+
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
+
+use stspp_hil_mcu::controller::{McuController, firmware_elf};
+use stspp_hil_mcu::front::{SharedController, UsbPort, share};
+use stspp_hil_mcu::soc::Variant;
+use stspp_hil_sim::device::Controller;
+use stspp_hil_sim::device::in_process::{InProcess, InProcessOptions};
+use stspp_hil_sim::front::bench::{Bench, Clock};
+use stspp_hil_sim::front::control::ControlFunction;
+use stspp_hil_sim::front::eyes::{Eye, FrameBank};
+use stspp_hil_sim::front::plug::{Cable, Plugged};
+use stspp_hil_sim::front::usb::UsbFunction;
+use stspp_hil_sim::front::usbip::server::{Export, Server};
+use stspp_hil_sim::front::uvc::UvcCamera;
+use stspp_hil_sim::front::uvc::descriptors::{Description, PixelFormat};
+use stspp_hil_sim::rig::{CAMERAS, Exposure, Rig, readout_ns};
+use stspp_hil_sim::world::{Camera, LightInterval, LightSource, SceneSpec, SensorModel, World};
+use stspp_protocol::timing::ProjectionTiming;
+use stspp_protocol::usb as ids;
+
+use crate::console::{Chip, Console};
+use crate::{Mcu, Serve};
+
+/// Exposures that a camera keeps for a host that is slow: a few, as cameras do.
+const FRAMES_KEPT: usize = 8;
+
+const FRAMES_PER_SECOND: u32 = 30;
+
+/// Gain of 1, which the cameras have at first.
+const GAIN_PERCENT: u32 = 100;
+
+/// What is behind the control interface.
+enum Control {
+    Emulated(UsbPort, SharedController),
+    InProcess(Box<InProcess>, String),
+}
+
+/// The sensor before it is served.
+pub struct Sensor {
+    world: Arc<World>,
+    bank: Arc<FrameBank>,
+    control: Control,
+    clock: Clock,
+}
+
+impl Sensor {
+    /// Builds the scene and powers the controller.
+    ///
+    /// # Errors
+    /// A scene that cannot be, or a firmware that does not start.
+    pub fn new(serve: &Serve) -> Result<Self, Box<dyn std::error::Error>> {
+        let (name, options) = serve.scene.split_once('?').unwrap_or((&serve.scene, ""));
+        let options: Vec<(&str, &str)> =
+            options.split('&').filter_map(|option| option.split_once('=')).collect();
+        if !matches!(serve.scale, 1 | 2 | 4 | 8 | 16) || !matches!(serve.bits, 8 | 10 | 12) {
+            return Err("--scale is 1, 2, 4, 8 or 16, and --bits 8, 10 or 12".into());
+        }
+        let model = SensorModel::with_seed(serve.seed).with_bits(serve.bits);
+        let model = if serve.scale > 1 { model.scaled_down(serve.scale) } else { model };
+        let world = Arc::new(World::new(&SceneSpec::parse(name, &options)?, model)?);
+        let (control, booted_ns) = control(serve)?;
+        let start = Instant::now();
+        let clock: Clock = Arc::new(move || {
+            booted_ns + u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX / 2)
+        });
+        let control = match control {
+            Unclocked::Emulated(controller) => {
+                let (shared, port) =
+                    share(*controller, Arc::clone(&clock)).ok_or("the chip has no USB")?;
+                Control::Emulated(port, shared)
+            }
+            Unclocked::InProcess(device, serial) => Control::InProcess(device, serial),
+        };
+        let bank = Arc::new(FrameBank::new(Arc::clone(&world)));
+        Ok(Self { world, bank, control, clock })
+    }
+
+    /// Scene and cameras.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+
+    /// Renders what each slot of the default timing shows, so that the stream need not wait for it.
+    pub fn prepare(&self) {
+        let timing = ProjectionTiming::default();
+        let close_ns = u64::from(timing.exposure_us) * 1000;
+        for slot in &timing.slots {
+            let projectors = (0..16u8).filter(|k| slot.projector_mask & 1 << k != 0);
+            let lit = projectors
+                .map(LightSource::Projector)
+                .chain(slot.floodlight.then_some(LightSource::Floodlight));
+            let lights: Vec<_> =
+                lit.map(|source| LightInterval { source, on_ns: 0, off_ns: close_ns }).collect();
+            for camera in CAMERAS {
+                let lights = lights.clone();
+                let (sequence, open_ns, ready_ns) = (0, 0, close_ns);
+                let exposure = Exposure { camera, sequence, open_ns, close_ns, ready_ns, lights };
+                self.bank.prepare(&exposure, GAIN_PERCENT);
+            }
+        }
+    }
+
+    /// The devices on offer, in the order 1-1, 1-2, 1-3, and what their user can do to them.
+    pub fn into_server(self) -> (Server, Console) {
+        let model = self.world.model();
+        let pixels = model.left.width * model.left.height;
+        let cables = [Cable::default(), Cable::default(), Cable::default()];
+        let rig =
+            |controller: Box<dyn Controller>| Rig::new(controller, readout_ns(pixels), FRAMES_KEPT);
+        let (bench, chip, control): (_, _, Arc<Mutex<dyn UsbFunction>>) = match self.control {
+            Control::Emulated(port, shared) => {
+                let bench = Bench::following(rig(Box::new(shared.clone())), self.clock);
+                let bus = shared.clone();
+                let bench = bench.with_frame_number(Arc::new(move |time_ns| {
+                    let mut controller = bus.lock();
+                    let chip = controller.chip();
+                    let ago_ms = chip.now_ns().saturating_sub(time_ns).div_ceil(1_000_000);
+                    let frame = u64::from(chip.soc().usbfs.host().frame());
+                    let modulus = u64::from(ids::SOF_MODULUS);
+                    ((frame + modulus - ago_ms % modulus) % modulus) as u16
+                }));
+                let port = Plugged::new(port, cables[0].clone());
+                (Arc::new(bench), Chip::Emulated(shared), Arc::new(Mutex::new(port)))
+            }
+            Control::InProcess(device, serial) => {
+                let bench = Arc::new(Bench::following(rig(device), self.clock));
+                let function = ControlFunction::new(Arc::clone(&bench), &serial);
+                let port = Plugged::new(function, cables[0].clone());
+                (Arc::clone(&bench), Chip::InProcess(bench), Arc::new(Mutex::new(port)))
+            }
+        };
+        let mut exports = vec![Export::new(control)];
+        let mut faults = Vec::new();
+        for (camera, cable) in CAMERAS.into_iter().zip(&cables[1..]) {
+            let eye = Eye::new(Arc::clone(&bench), Arc::clone(&self.bank), camera);
+            faults.push(eye.faults());
+            let device = UvcCamera::new(description(camera, model), eye);
+            let port: Arc<Mutex<dyn UsbFunction>> =
+                Arc::new(Mutex::new(Plugged::new(device, cable.clone())));
+            exports.push(Export::new(port));
+        }
+        (Server::new(exports), Console::new(cables, faults, chip))
+    }
+}
+
+/// A controller before its clock is known: the chip has used up some time to enumerate.
+enum Unclocked {
+    Emulated(Box<McuController>),
+    InProcess(Box<InProcess>, String),
+}
+
+fn control(serve: &Serve) -> Result<(Unclocked, u64), Box<dyn std::error::Error>> {
+    if serve.mcu == Mcu::None {
+        let options = InProcessOptions::seeded(serve.seed);
+        let serial = options.serial.to_string();
+        return Ok((Unclocked::InProcess(Box::new(InProcess::new(options)), serial), 0));
+    }
+    let elf = serve.firmware.clone().unwrap_or_else(|| firmware_elf(Variant::F350));
+    let controller = McuController::load(Variant::F350, &elf).map_err(|error| {
+        format!("{error}; build the firmware by `cargo xtask firmware`, or take --mcu none")
+    })?;
+    let booted_ns = controller.now_ns();
+    Ok((Unclocked::Emulated(Box::new(controller)), booted_ns))
+}
+
+fn description(camera: Camera, model: &SensorModel) -> Description {
+    let (side, model) = match camera {
+        Camera::Left => ("left", &model.left),
+        Camera::Right => ("right", &model.right),
+    };
+    Description {
+        vendor_id: ids::VENDOR_ID,
+        product_id: ids::PRODUCT_ID,
+        product: format!("stspp {side} camera"),
+        serial: "SIMULATED".into(),
+        width: model.width as u16,
+        height: model.height as u16,
+        format: if model.bits <= 8 { PixelFormat::Grey } else { PixelFormat::Y16 },
+        interval_100ns: 10_000_000 / FRAMES_PER_SECOND,
+    }
+}

@@ -1,0 +1,274 @@
+//! The simulated sensor, the machine that it is plugged into, and what scenarios do with them.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use super::machine::{Machine, Reply};
+use super::server::Server;
+use crate::workspace;
+
+/// The cameras have 1/SCENE_SCALE of the pixels in each direction where depth is computed in the guest,
+/// whose emulated processor takes twenty times as long as a real one.
+pub const SCENE_SCALE: u32 = 2;
+
+/// Where the guest finds the cameras' calibration.
+pub const CALIBRATION: &str = "etc/stspp/camchain.yaml";
+
+/// Devices by name: virtio port and bus id.
+pub const DEVICES: [(&str, &str); 3] = [("control", "1-1"), ("left", "1-2"), ("right", "1-3")];
+
+/// Sensor and machine.
+pub struct Bench {
+    /// The machine.
+    pub machine: Machine,
+    /// The simulated sensor.
+    pub server: Server,
+    /// For files that come out of the guest.
+    pub folder: PathBuf,
+    /// The in-process result, once computed.
+    in_process: Option<Score>,
+    /// The program that compares clouds with the truth.
+    pub scorer: PathBuf,
+    /// The program under test, on this machine.
+    pub stspp: PathBuf,
+}
+
+/// How a cloud compares with the truth.
+#[derive(Debug, Clone, Copy)]
+pub struct Score {
+    /// Points.
+    pub points: u64,
+    /// RMS of the errors within 5 mm.
+    pub rms_mm: f64,
+}
+
+impl Bench {
+    /// A bench whose devices are not plugged in yet.
+    pub fn new(
+        machine: Machine,
+        server: Server,
+        folder: &Path,
+        stspp: PathBuf,
+        scorer: PathBuf,
+    ) -> Self {
+        Self { machine, server, folder: folder.to_owned(), in_process: None, scorer, stspp }
+    }
+
+    /// The source of the simulated sensor in the guest.
+    pub fn source(&self) -> String {
+        format!("usb:?calibration=/{CALIBRATION}")
+    }
+
+    /// Plugs a device into the guest.
+    ///
+    /// # Errors
+    /// What the guest said.
+    pub fn plug_in(&mut self, device: &str) -> Result<(), String> {
+        let (port, bus_id) =
+            DEVICES.into_iter().find(|(name, _)| *name == device).ok_or("no such device")?;
+        // After an unplugging the connection to the server comes back within a second.
+        let deadline = Instant::now() + Duration::from_secs(15);
+        loop {
+            let reply = self.side(&["attach", port, bus_id])?;
+            if reply.code == 0 {
+                return Ok(());
+            }
+            if Instant::now() > deadline {
+                return Err(format!("attach {bus_id}: {}", reply.text().trim()));
+            }
+            std::thread::sleep(Duration::from_millis(300));
+        }
+    }
+
+    /// Plugs a device in if the guest's kernel has none in its place.
+    ///
+    /// # Errors
+    /// What the guest said.
+    pub fn plug_in_if_gone(&mut self, device: &str) -> Result<(), String> {
+        // A device that resets itself leaves the bus; the kernel takes a moment to notice.
+        std::thread::sleep(Duration::from_millis(1500));
+        let list = self.stspp(20, &["list", "--json"])?;
+        if device == "control" && !list.text().contains("\"kind\": \"usb\"") {
+            self.plug_in(device)?;
+        }
+        Ok(())
+    }
+
+    /// A program in the guest that must succeed; its output.
+    ///
+    /// # Errors
+    /// Its exit code and output.
+    pub fn run(&mut self, seconds: u32, program: &str, words: &[&str]) -> Result<String, String> {
+        let seconds = seconds.to_string();
+        let mut request = vec!["run", &seconds, program];
+        request.extend(words);
+        let reply = self.machine.request(&request)?;
+        let text = reply.text();
+        if reply.code == 0 {
+            Ok(text)
+        } else {
+            Err(format!("{program} {}: code {}: {}", words.join(" "), reply.code, text.trim()))
+        }
+    }
+
+    /// `stspp` in the guest.
+    ///
+    /// # Errors
+    /// When the machine does not answer.
+    pub fn stspp(&mut self, seconds: u32, words: &[&str]) -> Result<Reply, String> {
+        let seconds = seconds.to_string();
+        let mut request = vec!["run", &seconds, "/bin/stspp"];
+        request.extend(words);
+        self.machine.request(&request)
+    }
+
+    /// `stspp` in the guest, which must succeed; its output.
+    ///
+    /// # Errors
+    /// Its exit code and output.
+    pub fn stspp_ok(&mut self, seconds: u32, words: &[&str]) -> Result<String, String> {
+        self.run(seconds, "/bin/stspp", words)
+    }
+
+    /// `stspp` in the guest, which must print one JSON object.
+    ///
+    /// # Errors
+    /// Its exit code and output.
+    pub fn stspp_json(&mut self, seconds: u32, words: &[&str]) -> Result<Value, String> {
+        let text = self.stspp_ok(seconds, words)?;
+        let from = text.find('{').unwrap_or(0);
+        serde_json::from_str(&text[from..]).map_err(|e| format!("{e}: {text}"))
+    }
+
+    /// Begins a stream of raw pairs in the guest.
+    ///
+    /// # Errors
+    /// When the machine does not answer.
+    pub fn start_stream(&mut self, count: &str, more: &[&str]) -> Result<(), String> {
+        let source = self.source();
+        let mut words = vec!["run", "60", "/bin/stspp", "stream", "--pairs", "--json"];
+        words.extend(["--source", &source, "-n", count]);
+        words.extend(more);
+        self.machine.send(&words)
+    }
+
+    /// Waits for the stream's end; its last counters.
+    ///
+    /// # Errors
+    /// When it failed.
+    pub fn finish_stream(&mut self) -> Result<Value, String> {
+        let reply = self.machine.receive()?;
+        let text = reply.text();
+        if reply.code != 0 {
+            return Err(format!("code {}: {}", reply.code, last_lines(&text)));
+        }
+        let line = text.lines().rfind(|line| line.contains("\"stats\"")).unwrap_or_default();
+        let json: Value = serde_json::from_str(line).map_err(|e| format!("{e}: {text}"))?;
+        Ok(json["stats"].clone())
+    }
+
+    /// Waits until the simulated sensor is lit.
+    ///
+    /// # Errors
+    /// When it stays dark for twenty seconds; what the guest's program said then.
+    pub fn wait_lit(&mut self) -> Result<(), String> {
+        let deadline = Instant::now() + Duration::from_secs(20);
+        while !self.server.is_lit()? {
+            if Instant::now() > deadline {
+                let said = self.machine.receive().map(|r| r.text()).unwrap_or_default();
+                return Err(format!("no light: {}", last_lines(&said)));
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        Ok(())
+    }
+
+    /// Checks that nothing is lit.
+    ///
+    /// # Errors
+    /// When something is.
+    pub fn dark(&self) -> Result<(), String> {
+        if self.server.is_lit()? { Err("light after the end".into()) } else { Ok(()) }
+    }
+
+    /// A request while a program runs.
+    ///
+    /// # Errors
+    /// When the machine does not answer.
+    pub fn side(&mut self, words: &[&str]) -> Result<Reply, String> {
+        self.machine.side(words)
+    }
+
+    /// A file of the guest.
+    ///
+    /// # Errors
+    /// What the guest said.
+    pub fn file(&mut self, path: &str) -> Result<Vec<u8>, String> {
+        let reply = self.machine.request(&["read", path])?;
+        if reply.code == 0 { Ok(reply.bytes) } else { Err(format!("{path}: {}", reply.text())) }
+    }
+
+    /// Compares a cloud with the scene.
+    ///
+    /// # Errors
+    /// When the comparison fails.
+    pub fn score(&self, name: &str, cloud: &[u8]) -> Result<Score, String> {
+        let path = self.folder.join(format!("{name}.ply"));
+        std::fs::write(&path, cloud).map_err(|e| format!("{}: {e}", path.display()))?;
+        self.score_file(&path)
+    }
+
+    fn score_file(&self, path: &Path) -> Result<Score, String> {
+        let output = Command::new(&self.scorer)
+            .arg(path)
+            .arg(scene_uri())
+            .output()
+            .map_err(|e| format!("{}: {e}", self.scorer.display()))?;
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        let json: Value = serde_json::from_str(&text).map_err(|_| {
+            format!("comparison with the truth: {}", String::from_utf8_lossy(&output.stderr))
+        })?;
+        let rms_mm = json["rms_mm"].as_f64().unwrap_or(f64::NAN);
+        Ok(Score { points: json["points"].as_u64().unwrap_or(0), rms_mm })
+    }
+
+    /// The same scene captured on this machine, without USB: computed once.
+    ///
+    /// # Errors
+    /// When that fails.
+    pub fn in_process_score(&mut self) -> Result<Score, String> {
+        if let Some(score) = self.in_process {
+            return Ok(score);
+        }
+        let out = self.folder.join("in-process");
+        let status = Command::new(&self.stspp)
+            .args(["capture", "--quiet", "--force", "--source", &scene_uri(), "--out"])
+            .arg(&out)
+            .stdout(std::process::Stdio::null())
+            .status();
+        if !status.is_ok_and(|s| s.success()) {
+            return Err("the capture in process failed".into());
+        }
+        let score = self.score_file(&out.join("cloud.ply"))?;
+        self.in_process = Some(score);
+        Ok(score)
+    }
+}
+
+/// The scene as a source of the in-process simulator.
+pub fn scene_uri() -> String {
+    format!("sim:sphere?scale={SCENE_SCALE}")
+}
+
+/// Where cargo puts a program.
+pub fn built(name: &str) -> PathBuf {
+    workspace::root().join("target/debug").join(name)
+}
+
+fn last_lines(text: &str) -> String {
+    let lines: Vec<&str> = text.lines().collect();
+    lines[lines.len().saturating_sub(4)..].join(" | ")
+}

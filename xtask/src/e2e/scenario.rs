@@ -1,0 +1,322 @@
+//! What is tried in the guest, in order: the sensor is found, configured, streams, gives depth that is
+//! held against the truth, and survives each fault once.
+
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use super::bench::{Bench, SCENE_SCALE};
+
+/// A scenario's name, and what runs it: what was seen, or what was wrong.
+pub type Scenario = (&'static str, fn(&mut Bench) -> Result<String, String>);
+
+/// All scenarios.
+pub const ALL: &[Scenario] = &[
+    ("kernel sees three devices", nodes),
+    ("protocol suite over USB", protocol_suite),
+    ("list", list),
+    ("doctor", doctor),
+    ("timing set, read back", timing),
+    ("camera controls", camera_controls),
+    ("ten pairs", pairs),
+    ("depth against truth", depth),
+    ("device busy", busy),
+    ("lost frame", |bench| frame_fault(bench, "left", "lost")),
+    ("duplicated frame", |bench| frame_fault(bench, "right", "duplicated")),
+    ("camera a frame late", |bench| frame_fault(bench, "left", "lagging")),
+    ("short picture", |bench| frame_fault(bench, "right", "short")),
+    ("halted endpoint", halt),
+    ("camera unplugged, plugged", camera_unplugged),
+    ("control unplugged, plugged", control_unplugged),
+    ("device reset", reset),
+    ("firmware hangs", hang),
+    ("interlock opens", interlock),
+    ("clock of the host steps", clock_step),
+    ("depth after all faults", depth),
+];
+
+fn nodes(bench: &mut Bench) -> Result<String, String> {
+    let expected = ["stspp left camera", "stspp right camera"];
+    let deadline = Instant::now() + Duration::from_secs(20);
+    let mut names = Vec::new();
+    while Instant::now() < deadline {
+        names.clear();
+        for number in 0..4 {
+            let path = format!("/sys/class/video4linux/video{number}/name");
+            let reply = bench.machine.request(&["read", &path])?;
+            if reply.code == 0 {
+                names.push(reply.text().trim().to_owned());
+            }
+        }
+        if names.len() == 4 {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    let missing = expected.iter().find(|e| !names.iter().any(|n| n.starts_with(*e)));
+    match missing {
+        None if names.len() == 4 => Ok("2 video and 2 metadata nodes by the stock uvcvideo".into()),
+        _ => Err(format!("the kernel made {names:?}")),
+    }
+}
+
+fn protocol_suite(bench: &mut Bench) -> Result<String, String> {
+    let arguments = ["--ignored", "--exact", "usb_of_this_machine"];
+    let text = bench.run(60, "/bin/transports", &arguments)?;
+    if text.contains("1 passed") {
+        Ok("the tests of sim: and serial: hold over libusb".into())
+    } else {
+        Err(format!("the test did not run: {text}"))
+    }
+}
+
+fn list(bench: &mut Bench) -> Result<String, String> {
+    let json = bench.stspp_json(30, &["list", "--json"])?;
+    let sensors = json["sensors"].as_array().cloned().unwrap_or_default();
+    let usb: Vec<&Value> = sensors.iter().filter(|s| s["kind"] == "usb").collect();
+    let [sensor] = usb.as_slice() else { return Err(format!("{json}")) };
+    let field = |name: &str| sensor[name].as_str().unwrap_or_default().to_owned();
+    let (serial, firmware, protocol) = (field("serial"), field("firmware"), field("protocol"));
+    if serial.len() != 24 || firmware.is_empty() || protocol.is_empty() {
+        return Err(format!("{sensor}"));
+    }
+    Ok(format!("{serial}, firmware {firmware}, protocol {protocol}"))
+}
+
+fn doctor(bench: &mut Bench) -> Result<String, String> {
+    let source = bench.source();
+    let json = bench.stspp_json(30, &["doctor", "--json", "--source", &source])?;
+    let checks = json["checks"].as_array().cloned().unwrap_or_default();
+    let poor = checks.iter().filter(|c| c["verdict"] == "poor").count();
+    if json["bad"] != 0 || checks.len() < 10 {
+        return Err(format!("{json}"));
+    }
+    Ok(format!("{} checks, none failed, {poor} could be better", checks.len()))
+}
+
+/// The longest period there is: the guest's emulated processor moves few pictures a second.
+const PERIOD_US: &str = "65000";
+
+fn timing(bench: &mut Bench) -> Result<String, String> {
+    let set = ["timing", "set", "--json", "--source", "usb:", "--defaults", "--period-us", PERIOD_US];
+    let set = bench.stspp_json(30, &set)?;
+    let got = bench.stspp_json(30, &["timing", "get", "--json", "--source", "usb:"])?;
+    let timing = |json: &Value| json.get("timing").unwrap_or(json).clone();
+    if timing(&set) != timing(&got) || timing(&got)["frame_period_us"] != 65_000 {
+        return Err(format!("set {set}, got {got}"));
+    }
+    let bad = bench.stspp(30, &["timing", "set", "--source", "usb:", "--exposure-us", "64999"])?;
+    if bad.code == 0 {
+        return Err("an impossible timing was accepted".into());
+    }
+    Ok(format!("a period of {PERIOD_US} us; an impossible one refused"))
+}
+
+fn camera_controls(bench: &mut Bench) -> Result<String, String> {
+    let bright = |bench: &mut Bench, options: &str| -> Result<f64, String> {
+        let source = format!("{}&{options}", bench.source());
+        let out = ["record", "/tmp/brightness", "--force", "--json", "--source", &source, "-n", "2"];
+        bench.stspp_ok(60, &out)?;
+        let picture = bench.file("/tmp/brightness/left/00.png")?;
+        super::bench::mean_of_png(&picture)
+    };
+    let full = bright(bench, "exposure_us=100000&gain=100")?;
+    let short = bright(bench, "exposure_us=4000&gain=100")?;
+    let gained = bright(bench, "exposure_us=4000&gain=400")?;
+    // The default exposure is 32 ms: an eighth of the light, then four times its numbers.
+    let told = format!("mean grey {full:.1}, {short:.1} at 1/8 of the exposure, {gained:.1} at gain 4");
+    if short < 0.35 * full && gained > 2.0 * short { Ok(told) } else { Err(told) }
+}
+
+/// Streams `count` raw pairs; the counters at the end, after they were found to add up.
+fn stream(bench: &mut Bench, count: &str) -> Result<Value, String> {
+    let source = bench.source();
+    let arguments = ["stream", "--pairs", "--json", "--source", &source, "-n", count];
+    let text = bench.stspp_ok(60, &arguments)?;
+    let last = text.lines().rfind(|line| line.contains("\"stats\"")).unwrap_or_default();
+    let json: Value = serde_json::from_str(last).map_err(|e| format!("{e}: {text}"))?;
+    let stats = json["stats"].clone();
+    add_up(&stats)?;
+    Ok(stats)
+}
+
+fn number(stats: &Value, path: &str) -> u64 {
+    stats.pointer(path).and_then(Value::as_u64).unwrap_or(0)
+}
+
+/// Every frame is in a pair, rejected by a cause, or dropped.
+fn add_up(stats: &Value) -> Result<(), String> {
+    let rejected: u64 = stats["rejected"]
+        .as_object()
+        .map_or(0, |causes| causes.values().filter_map(Value::as_u64).sum());
+    let given = number(stats, "/frames_left") + number(stats, "/frames_right");
+    let found = 2 * number(stats, "/pairs") + rejected + number(stats, "/dropped_capture");
+    if given == found { Ok(()) } else { Err(format!("{given} frames, {found} accounted for: {stats}")) }
+}
+
+fn pairs(bench: &mut Bench) -> Result<String, String> {
+    let stats = stream(bench, "10")?;
+    let [pairs, triggers] = ["/pairs", "/triggers"].map(|p| number(&stats, p));
+    bench.dark()?;
+    Ok(format!("{pairs} pairs of {triggers} triggers, all frames accounted for"))
+}
+
+fn depth(bench: &mut Bench) -> Result<String, String> {
+    let source = bench.source();
+    let arguments = ["capture", "--force", "--json", "--source", &source, "--out", "/tmp/depth"];
+    bench.stspp_ok(150, &arguments)?;
+    let cloud = bench.file("/tmp/depth/cloud.ply")?;
+    let guest = bench.score("guest", &cloud)?;
+    let host = bench.in_process_score()?;
+    let ratio = guest.rms_mm / host.rms_mm;
+    let told = format!(
+        "RMS {:.4} mm, in-process {:.4} mm ({:+.1} %), {} and {} points at 1/{SCENE_SCALE} scale",
+        guest.rms_mm,
+        host.rms_mm,
+        100.0 * (ratio - 1.0),
+        guest.points,
+        host.points
+    );
+    bench.dark()?;
+    let alike = (0.95..=1.05).contains(&ratio) && guest.points * 100 >= host.points * 97;
+    if alike { Ok(told) } else { Err(told) }
+}
+
+fn busy(bench: &mut Bench) -> Result<String, String> {
+    // One process holds the device while another asks for it.
+    let source = bench.source();
+    let arguments = ["run", "30", "/bin/stspp", "stream", "--pairs", "--source", &source, "-n", "60"];
+    bench.machine.send(&arguments)?;
+    bench.wait_lit()?;
+    let reply = bench.side(&["run", "20", "/bin/stspp", "info", "--source", "usb:"])?;
+    let first = bench.machine.receive()?;
+    if reply.code != 5 || !reply.text().contains("in use by another program") {
+        return Err(format!("code {}: {}", reply.code, reply.text()));
+    }
+    if first.code != 0 {
+        return Err(format!("the owner was disturbed: {}", first.text()));
+    }
+    Ok("named, exit code 5; the owner was not disturbed".into())
+}
+
+fn frame_fault(bench: &mut Bench, camera: &str, fault: &str) -> Result<String, String> {
+    bench.start_stream("40", &[])?;
+    bench.wait_lit()?;
+    std::thread::sleep(Duration::from_millis(1500));
+    bench.server.command(&format!("fault {camera} {fault}"))?;
+    let stats = bench.finish_stream()?;
+    add_up(&stats)?;
+    let counted: Vec<String> = [
+        ("lost partner", "/rejected/partner_missing"),
+        ("duplicate", "/rejected/duplicate"),
+        ("late", "/rejected/late"),
+        ("mislabelled", "/rejected/mislabelled"),
+        ("without trigger", "/rejected/no_trigger"),
+        ("damaged left", "/damaged_left"),
+        ("damaged right", "/damaged_right"),
+        ("missing left", "/missing_left"),
+        ("missing right", "/missing_right"),
+    ]
+    .into_iter()
+    .filter(|(_, path)| number(&stats, path) > 0)
+    .map(|(name, path)| format!("{} {name}", number(&stats, path)))
+    .collect();
+    Ok(format!("40 pairs went on; counted: {}", counted.join(", ")))
+}
+
+fn halt(bench: &mut Bench) -> Result<String, String> {
+    bench.start_stream("40", &[])?;
+    bench.wait_lit()?;
+    std::thread::sleep(Duration::from_millis(700));
+    bench.server.command("halt replies")?;
+    std::thread::sleep(Duration::from_millis(700));
+    bench.server.command("halt events")?;
+    let stats = bench.finish_stream()?;
+    add_up(&stats)?;
+    let repeated = number(&stats, "/link/repeated");
+    Ok(format!("both IN endpoints halted and cleared, {repeated} requests repeated"))
+}
+
+/// Unplugs `device` during a stream that waits for it, plugs it in again, and expects the stream to
+/// go on.
+fn unplug(bench: &mut Bench, device: &str) -> Result<String, String> {
+    bench.start_stream("50", &["--reconnect", "30"])?;
+    bench.wait_lit()?;
+    std::thread::sleep(Duration::from_millis(1500));
+    bench.server.command(&format!("unplug {device}"))?;
+    let begun = Instant::now();
+    while bench.server.is_lit()? {
+        if begun.elapsed() > Duration::from_secs(5) {
+            return Err("the light stays on".into());
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let dark_ms = begun.elapsed().as_millis();
+    std::thread::sleep(Duration::from_millis(500));
+    bench.server.command(&format!("plug {device}"))?;
+    bench.plug_in(device)?;
+    bench.finish_stream()?;
+    bench.dark()?;
+    Ok(format!("dark within {dark_ms} ms, the same process streamed on"))
+}
+
+fn camera_unplugged(bench: &mut Bench) -> Result<String, String> {
+    unplug(bench, "right")
+}
+
+fn control_unplugged(bench: &mut Bench) -> Result<String, String> {
+    unplug(bench, "control")
+}
+
+/// Does something to the device during a stream and expects it to end with an error that says `word`.
+fn ends_with(bench: &mut Bench, command: &str, word: &str) -> Result<String, String> {
+    bench.start_stream("400", &[])?;
+    bench.wait_lit()?;
+    std::thread::sleep(Duration::from_millis(1000));
+    bench.server.command(command)?;
+    let reply = bench.machine.receive()?;
+    let text = reply.text();
+    let error = text.lines().rfind(|line| line.contains("error:")).unwrap_or_default().to_owned();
+    bench.dark()?;
+    if reply.code == 0 || !error.contains(word) {
+        return Err(format!("code {}: {text}", reply.code));
+    }
+    Ok(error.trim_start_matches("error: ").chars().take(90).collect())
+}
+
+/// The device is plugged in again by its kernel, its faults are cleared, and it streams.
+fn works_again(bench: &mut Bench, told: String) -> Result<String, String> {
+    bench.plug_in_if_gone("control")?;
+    let source = bench.source();
+    bench.stspp_ok(30, &["doctor", "--clear-faults", "--quiet", "--source", &source])?;
+    stream(bench, "12")?;
+    Ok(told)
+}
+
+fn reset(bench: &mut Bench) -> Result<String, String> {
+    let told = ends_with(bench, "reset", "")?;
+    works_again(bench, told)
+}
+
+fn hang(bench: &mut Bench) -> Result<String, String> {
+    let told = ends_with(bench, "hang", "")?;
+    works_again(bench, told)
+}
+
+fn interlock(bench: &mut Bench) -> Result<String, String> {
+    let told = ends_with(bench, "interlock open", "interlock")?;
+    bench.server.command("interlock closed")?;
+    works_again(bench, told)
+}
+
+fn clock_step(bench: &mut Bench) -> Result<String, String> {
+    bench.start_stream("40", &[])?;
+    bench.wait_lit()?;
+    std::thread::sleep(Duration::from_millis(1000));
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    let stepped = now.map_or(0, |d| d.as_secs()) + 7200;
+    bench.side(&["clock", &stepped.to_string()])?;
+    let stats = bench.finish_stream()?;
+    add_up(&stats)?;
+    Ok("two hours forward; 40 pairs went on".into())
+}
