@@ -48,6 +48,18 @@ impl RawImage {
         }
     }
 
+    /// Mean of all pixels, 0 for an empty image.
+    pub fn mean_grey(&self) -> f64 {
+        fn mean<T: Copy + Into<u64>>(pixels: &[T]) -> f64 {
+            let sum: u64 = pixels.iter().map(|&v| v.into()).sum();
+            sum as f64 / pixels.len().max(1) as f64
+        }
+        match &self.pixels {
+            RawPixels::Gray8(image) => mean(image.as_slice()),
+            RawPixels::Gray16(image) => mean(image.as_slice()),
+        }
+    }
+
     /// The largest value a pixel can have.
     pub fn full_scale(&self) -> u16 {
         u16::MAX >> (16 - self.bits.clamp(1, 16))

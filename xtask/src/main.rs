@@ -19,7 +19,8 @@ cargo xtask licences         check the licences of everything that ships against
 cargo xtask firmware [f330] [f350] [--install] [--test]
                              builds the firmware, prints flash and RAM, fails over budget;
                              --install gets the compiler's target, --test runs its host tests
-cargo xtask e2e              plugs simulated USB cameras into a Debian kernel in QEMU
+cargo xtask e2e [NAME]       plugs the simulated sensor into a Debian kernel in QEMU and tries the
+                             stspp binary there: all scenarios, or those with NAME in their name
 cargo xtask help             this text";
 
 fn main() -> ExitCode {
@@ -28,7 +29,8 @@ fn main() -> ExitCode {
     let outcome = match arguments.as_slice() {
         ["test"] => return test::run(test::Depth::Full),
         ["test", "--quick"] => return test::run(test::Depth::Quick),
-        ["e2e"] => e2e::run(),
+        ["e2e"] => e2e::run(None),
+        ["e2e", only] => e2e::run(Some(only)),
         ["arrows"] => workspace::metadata().and_then(|m| arrows::check(&m)),
         ["licences"] => workspace::metadata().and_then(|m| licences::check(&m)),
         ["firmware", rest @ ..] => firmware::run(rest),

@@ -1,5 +1,5 @@
-//! What the host asks for, a line each over the port `control`, words apart by the unit separator
-//! (0x1f):
+//! What the host asks for, a line each over the port `control` or, beside a program that is running,
+//! `side`; words apart by the unit separator (0x1f):
 //!
 //! * `run SECONDS PROGRAM ARGUMENT...`: answers with the program's output as it comes, then its exit
 //!   code; a program that takes longer is killed (code 124)
@@ -17,12 +17,12 @@ use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-/// Serves until `poweroff` or the end of the port.
+/// Serves a port until `poweroff` or its end.
 ///
 /// # Errors
 /// The port's.
-pub fn serve() -> io::Result<()> {
-    let port = ports::open("control")?;
+pub fn serve(name: &str) -> io::Result<()> {
+    let port = ports::open(name)?;
     let answer = Arc::new(Mutex::new(port.try_clone()?));
     for line in BufReader::new(port).lines() {
         let line = line?;

@@ -8,9 +8,10 @@ use stspp_hil_sim::device::Controller;
 use stspp_hil_sim::front::bench::Bench;
 use stspp_hil_sim::front::eyes::FrameFault;
 use stspp_hil_sim::front::plug::Cable;
+use stspp_protocol::usb;
 
 const HELP: &str = "unplug control|left|right, plug control|left|right, \
-                    fault left|right lost|duplicated|lagging|short, interlock open|closed, \
+                    halt requests|replies|events, fault left|right lost|duplicated|lagging|short, interlock open|closed, \
                     hang, reset, status";
 
 /// The controller's inputs.
@@ -43,6 +44,7 @@ impl Console {
         let done = match words.as_slice() {
             ["unplug", device] => self.plug(device, false),
             ["plug", device] => self.plug(device, true),
+            ["halt", endpoint] => self.halt(endpoint),
             ["fault", camera, fault] => self.fault(camera, fault),
             ["interlock", "open"] => self.with_controller(|c| c.set_interlock_closed(false)),
             ["interlock", "closed"] => self.with_controller(|c| c.set_interlock_closed(true)),
@@ -60,6 +62,17 @@ impl Console {
     fn plug(&self, device: &str, plugged: bool) -> Option<()> {
         let at = ["control", "left", "right"].iter().position(|known| *known == device)?;
         self.cables[at].set_plugged(plugged);
+        Some(())
+    }
+
+    fn halt(&self, endpoint: &str) -> Option<()> {
+        let endpoint = match endpoint {
+            "requests" => usb::ENDPOINT_REQUESTS,
+            "replies" => usb::ENDPOINT_REPLIES,
+            "events" => usb::ENDPOINT_EVENTS,
+            _ => return None,
+        };
+        self.cables[0].halt(endpoint);
         Some(())
     }
 

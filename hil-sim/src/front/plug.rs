@@ -1,30 +1,43 @@
-//! A USB device whose cable can be pulled.
+//! A USB device whose cable can be pulled and whose endpoints can be halted.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use super::usb::{Answer, Identity, Setup, UsbFunction};
+use super::usb::{Answer, Identity, Kind, Setup, UsbFunction};
 
 /// The cable of a device: in at first.
 #[derive(Debug, Clone)]
-pub struct Cable(Arc<AtomicBool>);
+pub struct Cable {
+    plugged: Arc<AtomicBool>,
+    /// Addresses of halted endpoints.
+    halted: Arc<Mutex<Vec<u8>>>,
+}
 
 impl Default for Cable {
     fn default() -> Self {
-        Self(Arc::new(AtomicBool::new(true)))
+        Self { plugged: Arc::new(AtomicBool::new(true)), halted: Arc::default() }
     }
 }
 
 impl Cable {
     /// Pulls it out, or plugs it in.
     pub fn set_plugged(&self, plugged: bool) {
-        self.0.store(plugged, Ordering::Release);
+        self.plugged.store(plugged, Ordering::Release);
     }
 
     /// Whether it is in.
     #[must_use]
     pub fn is_plugged(&self) -> bool {
-        self.0.load(Ordering::Acquire)
+        self.plugged.load(Ordering::Acquire)
+    }
+
+    /// Halts an endpoint until the host clears it.
+    pub fn halt(&self, endpoint: u8) {
+        self.halted().push(endpoint);
+    }
+
+    fn halted(&self) -> MutexGuard<'_, Vec<u8>> {
+        self.halted.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -47,18 +60,38 @@ impl<F: UsbFunction> UsbFunction for Plugged<F> {
     }
 
     fn reset(&mut self) {
+        self.cable.halted().clear();
         self.function.reset();
     }
 
     fn control(&mut self, setup: Setup, data: &[u8]) -> Answer<Vec<u8>> {
+        const CLEAR_FEATURE: u8 = 1;
+        if setup.kind() == Kind::Standard
+            && setup.recipient() == 2
+            && setup.request == CLEAR_FEATURE
+        {
+            let mut halted = self.cable.halted();
+            let before = halted.len();
+            halted.retain(|endpoint| u16::from(*endpoint) != setup.index);
+            if halted.len() < before {
+                // The device itself knows of no halt.
+                return Answer::Done(vec![]);
+            }
+        }
         self.function.control(setup, data)
     }
 
     fn transfer_in(&mut self, endpoint: u8, length: usize) -> Answer<Vec<u8>> {
+        if self.cable.halted().contains(&(endpoint | 0x80)) {
+            return Answer::Stall;
+        }
         self.function.transfer_in(endpoint, length)
     }
 
     fn transfer_out(&mut self, endpoint: u8, data: &[u8]) -> Answer<usize> {
+        if self.cable.halted().contains(&endpoint) {
+            return Answer::Stall;
+        }
         self.function.transfer_out(endpoint, data)
     }
 

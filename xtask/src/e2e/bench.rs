@@ -18,7 +18,8 @@ pub const SCENE_SCALE: u32 = 2;
 pub const CALIBRATION: &str = "etc/stspp/camchain.yaml";
 
 /// Devices by name: virtio port and bus id.
-pub const DEVICES: [(&str, &str); 3] = [("control", "1-1"), ("left", "1-2"), ("right", "1-3")];
+pub const DEVICES: [(&str, &str, &str); 3] =
+    [("control", "usb-control", "1-1"), ("left", "usb-left", "1-2"), ("right", "usb-right", "1-3")];
 
 /// Sensor and machine.
 pub struct Bench {
@@ -67,8 +68,8 @@ impl Bench {
     /// # Errors
     /// What the guest said.
     pub fn plug_in(&mut self, device: &str) -> Result<(), String> {
-        let (port, bus_id) =
-            DEVICES.into_iter().find(|(name, _)| *name == device).ok_or("no such device")?;
+        let (_, port, bus_id) =
+            DEVICES.into_iter().find(|(name, ..)| *name == device).ok_or("no such device")?;
         // After an unplugging the connection to the server comes back within a second.
         let deadline = Instant::now() + Duration::from_secs(15);
         loop {

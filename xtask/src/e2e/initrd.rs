@@ -70,17 +70,25 @@ impl Archive {
     }
 }
 
-/// The guest's archive: `init` as first process, `programs` under /bin by their file names.
+/// The guest's archive: `init` as first process, `programs` under /bin by the names given, `files` at
+/// their paths.
 ///
 /// # Errors
 /// Names the file that could not be read.
-pub fn build(kernel: &Kernel, init: &Path, programs: &[PathBuf]) -> Result<Vec<u8>, String> {
+pub fn build(
+    kernel: &Kernel,
+    init: &Path,
+    programs: &[(&str, PathBuf)],
+    files: &[(&str, Vec<u8>)],
+) -> Result<Vec<u8>, String> {
     let mut archive = Archive::default();
     let mut libraries = BTreeSet::new();
     archive.file("init", 0o755, &read(init)?);
     libraries.extend(needs(init)?);
-    for program in programs {
-        let name = program.file_name().unwrap_or_default().to_string_lossy();
+    for (path, content) in files {
+        archive.file(path, 0o644, content);
+    }
+    for (name, program) in programs {
         archive.file(&format!("bin/{name}"), 0o755, &read(program)?);
         libraries.extend(needs(program)?);
     }

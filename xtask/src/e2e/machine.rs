@@ -7,10 +7,14 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+/// Longest wait for an answer: more than any program in the guest may take.
+const PATIENCE: Duration = Duration::from_secs(200);
+
 /// A running machine; ended when dropped, whatever happened.
 pub struct Machine {
     qemu: Child,
     control: BufReader<UnixStream>,
+    side: BufReader<UnixStream>,
     folder: PathBuf,
 }
 
@@ -20,7 +24,14 @@ pub struct Reply {
     /// Exit code of the program, 0 when the request itself was carried out.
     pub code: i32,
     /// What it printed, or the answer.
-    pub text: String,
+    pub bytes: Vec<u8>,
+}
+
+impl Reply {
+    /// The answer as text.
+    pub fn text(&self) -> String {
+        String::from_utf8_lossy(&self.bytes).into_owned()
+    }
 }
 
 impl Machine {
@@ -37,8 +48,10 @@ impl Machine {
         usbip_port: u16,
         folder: &Path,
     ) -> Result<Self, String> {
-        let socket = folder.join("control.sock");
-        let _ = std::fs::remove_file(&socket);
+        let sockets = ["control", "side"].map(|name| (name, folder.join(format!("{name}.sock"))));
+        for (_, socket) in &sockets {
+            let _ = std::fs::remove_file(socket);
+        }
         let console = folder.join("console.log");
         let mut command = Command::new("qemu-system-x86_64");
         command
@@ -50,14 +63,17 @@ impl Machine {
             .arg(initrd)
             .args(["-append", "console=ttyS0 quiet panic=-1 mitigations=off"])
             .args(["-serial", &format!("file:{}", console.display())])
-            .args(["-device", "virtio-serial-pci,max_ports=16"])
-            .arg("-chardev")
-            .arg(format!("socket,id=control,path={},server=on,wait=off", socket.display()))
-            .args(["-device", "virtserialport,chardev=control,name=control"]);
+            .args(["-device", "virtio-serial-pci,max_ports=16"]);
+        for (name, socket) in &sockets {
+            command
+                .arg("-chardev")
+                .arg(format!("socket,id={name},path={},server=on,wait=off", socket.display()))
+                .args(["-device", &format!("virtserialport,chardev={name},name={name}")]);
+        }
         for port in ports {
             command
                 .arg("-chardev")
-                .arg(format!("socket,id={port},host=127.0.0.1,port={usbip_port}"))
+                .arg(format!("socket,id={port},host=127.0.0.1,port={usbip_port},reconnect=1"))
                 .args(["-device", &format!("virtserialport,chardev={port},name={port}")]);
         }
         let mut qemu = command
@@ -66,24 +82,25 @@ impl Machine {
             .stderr(File::create(folder.join("qemu.log")).map_err(|e| format!("qemu's log: {e}"))?)
             .spawn()
             .map_err(|e| format!("qemu-system-x86_64 could not be run: {e}"))?;
-        let deadline = Instant::now() + Duration::from_secs(120);
-        let stream = loop {
-            if let Ok(stream) = UnixStream::connect(&socket) {
-                break stream;
-            }
-            let ended = qemu.try_wait().ok().flatten();
-            if ended.is_some() || Instant::now() > deadline {
-                let _ = qemu.kill();
-                let _ = qemu.wait();
-                return Err(format!("QEMU did not start\n{}", tail(&folder.join("qemu.log"))));
-            }
-            std::thread::sleep(Duration::from_millis(50));
+        let mut connect = |socket: &Path| -> Result<BufReader<UnixStream>, String> {
+            let deadline = Instant::now() + Duration::from_secs(120);
+            let stream = loop {
+                if let Ok(stream) = UnixStream::connect(socket) {
+                    break stream;
+                }
+                let ended = qemu.try_wait().ok().flatten();
+                if ended.is_some() || Instant::now() > deadline {
+                    let _ = qemu.kill();
+                    let _ = qemu.wait();
+                    return Err(format!("QEMU did not start\n{}", tail(&folder.join("qemu.log"))));
+                }
+                std::thread::sleep(Duration::from_millis(50));
+            };
+            stream.set_read_timeout(Some(PATIENCE)).map_err(|e| format!("control port: {e}"))?;
+            Ok(BufReader::new(stream))
         };
-        stream
-            .set_read_timeout(Some(Duration::from_secs(120)))
-            .map_err(|e| format!("control port: {e}"))?;
-        let mut machine =
-            Self { qemu, control: BufReader::new(stream), folder: folder.to_path_buf() };
+        let (control, side) = (connect(&sockets[0].1)?, connect(&sockets[1].1)?);
+        let mut machine = Self { qemu, control, side, folder: folder.to_path_buf() };
         // What is written before the guest is up waits in the port.
         let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let seconds = now.map_or(0, |d| d.as_secs()).to_string();
@@ -98,29 +115,65 @@ impl Machine {
     /// # Errors
     /// When the machine does not answer.
     pub fn request(&mut self, words: &[&str]) -> Result<Reply, String> {
-        let line = words.join("\x1f") + "\n";
-        let failed = |e: std::io::Error| format!("control port: {e}");
-        self.control.get_mut().write_all(line.as_bytes()).map_err(failed)?;
-        let mut text = Vec::new();
-        loop {
-            let mut head = String::new();
-            if self.control.read_line(&mut head).map_err(failed)? == 0 {
-                let console = tail(&self.folder.join("console.log"));
-                return Err(format!("the machine went away\n{console}"));
+        self.send(words)?;
+        self.receive()
+    }
+
+    /// Sends a request without waiting: [`Machine::receive`] does that.
+    ///
+    /// # Errors
+    /// When the port is closed.
+    pub fn send(&mut self, words: &[&str]) -> Result<(), String> {
+        write(&mut self.control, words)
+    }
+
+    /// Waits for the end of the request sent last.
+    ///
+    /// # Errors
+    /// When the machine does not answer.
+    pub fn receive(&mut self) -> Result<Reply, String> {
+        read(&mut self.control).map_err(|e| self.explain(&e))
+    }
+
+    /// A request beside one that is under way.
+    ///
+    /// # Errors
+    /// When the machine does not answer.
+    pub fn side(&mut self, words: &[&str]) -> Result<Reply, String> {
+        write(&mut self.side, words)?;
+        read(&mut self.side).map_err(|e| self.explain(&e))
+    }
+
+    fn explain(&self, error: &str) -> String {
+        format!("{error}\n{}", tail(&self.folder.join("console.log")))
+    }
+}
+
+fn write(port: &mut BufReader<UnixStream>, words: &[&str]) -> Result<(), String> {
+    let line = words.join("\x1f") + "\n";
+    port.get_mut().write_all(line.as_bytes()).map_err(|e| format!("control port: {e}"))
+}
+
+fn read(port: &mut BufReader<UnixStream>) -> Result<Reply, String> {
+    let failed = |e: std::io::Error| format!("control port: {e}");
+    let mut bytes = Vec::new();
+    loop {
+        let mut head = String::new();
+        if port.read_line(&mut head).map_err(failed)? == 0 {
+            return Err("the machine went away".into());
+        }
+        match head.trim_end().split_once(' ') {
+            Some(("o", length)) => {
+                let length: usize = length.parse().map_err(|_| "broken answer")?;
+                let from = bytes.len();
+                bytes.resize(from + length, 0);
+                port.read_exact(&mut bytes[from..]).map_err(failed)?;
             }
-            match head.trim_end().split_once(' ') {
-                Some(("o", length)) => {
-                    let length: usize = length.parse().map_err(|_| "broken answer")?;
-                    let from = text.len();
-                    text.resize(from + length, 0);
-                    self.control.read_exact(&mut text[from..]).map_err(failed)?;
-                }
-                Some(("x", code)) => {
-                    let code = code.parse().map_err(|_| "broken answer")?;
-                    return Ok(Reply { code, text: String::from_utf8_lossy(&text).into_owned() });
-                }
-                _ => return Err(format!("broken answer {head:?}")),
+            Some(("x", code)) => {
+                let code = code.parse().map_err(|_| "broken answer")?;
+                return Ok(Reply { code, bytes });
             }
+            _ => return Err(format!("broken answer {head:?}")),
         }
     }
 }

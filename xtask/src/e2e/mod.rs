@@ -1,117 +1,158 @@
-//! `cargo xtask e2e`: simulated USB cameras plugged into a real Linux kernel in QEMU.
+//! `cargo xtask e2e`: the simulated sensor plugged into a real Linux kernel in QEMU, and the unmodified
+//! `stspp` binary in that guest, which uses libusb and V4L2 as on a desk.
 //!
-//! [`kernel`] fetches a Debian kernel, [`initrd`] packs the guest, [`machine`] boots it and talks to
-//! its first process. So far there is one scenario: both cameras attach over USB/IP, and the stock UVC
-//! driver makes video and metadata nodes of them. A stage of `cargo xtask test` it becomes with the
-//! scenarios that take depth frames in the guest.
+//! ```text
+//!   this machine                              guest (Debian kernel, no shell, no network)
+//!   hil-sim serve ── TCP ── virtio port ──── guest-init ── vhci-hcd ── usbfs, uvcvideo ── stspp
+//!   xtask ────────────────── virtio port ──── guest-init runs what it is told
+//! ```
+//!
+//! [`kernel`] fetches a Debian kernel, [`initrd`] packs the guest, [`machine`] boots it and talks to its
+//! first process, [`server`] is the simulated sensor, [`bench`](mod@bench) both together, [`scenario`]
+//! what is tried. Everything ends with this process, however that ends.
 
+mod bench;
 mod initrd;
 mod kernel;
 mod machine;
+mod scenario;
+mod server;
 
-use crate::{debian, workspace};
-use std::io::{BufRead, BufReader};
-use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use crate::{debian, firmware, workspace};
+use bench::{Bench, CALIBRATION, DEVICES, SCENE_SCALE, built};
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
-const PACKAGES: &[&str] = &["qemu-system-x86", "kmod", "xz-utils"];
+/// Debian packages of this stage.
+pub const PACKAGES: &[&str] = &["qemu-system-x86", "kmod", "xz-utils"];
 
-/// How long the kernel may take to make nodes of what was plugged in.
-const SETTLE: Duration = Duration::from_secs(20);
+/// No further scenario is begun after this long: the stage ends within six minutes.
+const TIME_LIMIT: Duration = Duration::from_secs(330);
 
-/// Runs the scenario and says what the kernel made of the cameras.
+/// A scenario that was run.
+struct Outcome {
+    name: &'static str,
+    took: Duration,
+    result: Result<String, String>,
+}
+
+/// Runs all scenarios, or those whose name contains `only`, and prints a table.
 ///
 /// # Errors
-/// Which step failed, and what the guest said.
-pub fn run() -> Result<String, String> {
+/// Which scenarios failed, or which step before them.
+pub fn run(only: Option<&str>) -> Result<String, String> {
     debian::ensure(PACKAGES)?;
+    let begun = Instant::now();
     let kernel = kernel::prepare()?;
     let folder = workspace::root().join("target/e2e");
-    let (guest, cameras) = build()?;
-    let archive = initrd::build(&kernel, &guest, &[])?;
+    let programs = build()?;
+    let calibration = folder.join("camchain.yaml");
+    let scale = SCENE_SCALE.to_string();
+    let arguments = [
+        "--scene",
+        "sphere",
+        "--scale",
+        &scale,
+        "--calibration",
+        &calibration.display().to_string(),
+    ];
+    let server = server::Server::start(&built("hil-sim"), &arguments, &folder.join("hil-sim.log"))?;
+    let in_guest = [("stspp", built("stspp")), ("transports", programs.transports)];
+    let files = [(CALIBRATION, read(&calibration)?)];
+    let archive = initrd::build(&kernel, &built("guest-init"), &in_guest, &files)?;
     let image = folder.join("initrd.cpio");
     std::fs::write(&image, archive).map_err(|e| format!("{}: {e}", image.display()))?;
 
-    let server = CameraServer::start(&cameras)?;
     let start = Instant::now();
-    let mut machine =
-        machine::Machine::boot(&kernel.image, &image, &["left", "right"], server.port, &folder)?;
+    let ports = DEVICES.map(|(_, port, _)| port);
+    let machine = machine::Machine::boot(&kernel.image, &image, &ports, server.port, &folder)?;
     println!("guest is up after {:.1} s", start.elapsed().as_secs_f64());
-    for (port, bus_id) in [("left", "1-1"), ("right", "1-2")] {
-        let reply = machine.request(&["attach", port, bus_id])?;
-        if reply.code != 0 {
-            return Err(format!("attach {bus_id}: {}", reply.text.trim()));
-        }
+    let scorer = built("examples/cloud_against_truth");
+    let mut bench = Bench::new(machine, server, &folder, built("stspp"), scorer);
+    for (device, ..) in DEVICES {
+        bench.plug_in(device)?;
     }
-    let expected = [
-        (0, "stspp left camera"),
-        (2, "stspp right camera"),
-        (1, "stspp left"),
-        (3, "stspp right"),
-    ];
-    let deadline = Instant::now() + SETTLE;
-    for (number, name) in expected {
-        let path = format!("/sys/class/video4linux/video{number}/name");
-        loop {
-            let reply = machine.request(&["read", &path])?;
-            if reply.code == 0 {
-                if !reply.text.starts_with(name) {
-                    return Err(format!("video{number} is {:?}, not {name:?}", reply.text.trim()));
-                }
-                break;
-            }
-            if Instant::now() > deadline {
-                return Err(format!("video{number} did not appear: {}", reply.text.trim()));
-            }
-            std::thread::sleep(Duration::from_millis(200));
+    let mut outcomes: Vec<Outcome> = Vec::new();
+    for (name, scenario) in scenario::ALL {
+        if only.is_some_and(|only| !name.contains(only)) {
+            continue;
         }
+        let start = Instant::now();
+        let result = if begun.elapsed() < TIME_LIMIT {
+            scenario(&mut bench)
+        } else {
+            Err("not begun: the time is up".into())
+        };
+        let outcome = Outcome { name, took: start.elapsed(), result };
+        println!("{}", line(&outcome));
+        outcomes.push(outcome);
     }
-    Ok("two UVC cameras attached over USB/IP: 2 video and 2 metadata nodes".into())
+    let failed: Vec<&str> = outcomes.iter().filter(|o| o.result.is_err()).map(|o| o.name).collect();
+    let seconds = begun.elapsed().as_secs();
+    if failed.is_empty() {
+        Ok(format!("{} scenarios in the guest passed in {seconds} s", outcomes.len()))
+    } else {
+        Err(format!(
+            "{} of {} scenarios failed: {}",
+            failed.len(),
+            outcomes.len(),
+            failed.join(", ")
+        ))
+    }
 }
 
-/// Builds the guest's first process and the camera server.
-fn build() -> Result<(PathBuf, PathBuf), String> {
+fn line(outcome: &Outcome) -> String {
+    let (word, text) = match &outcome.result {
+        Ok(text) => ("passed", text),
+        Err(text) => ("FAILED", text),
+    };
+    let seconds = outcome.took.as_secs_f64();
+    format!("{:<28} {word:<7} {seconds:>6.1} s  {text}", outcome.name)
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, String> {
+    std::fs::read(path).map_err(|e| format!("{}: {e}", path.display()))
+}
+
+/// What [`build`] has made, besides what has a fixed place.
+struct Programs {
+    /// The test binary with the protocol suite.
+    transports: PathBuf,
+}
+
+/// Builds the guest's first process, the simulated sensor with its firmware, and the program under test.
+fn build() -> Result<Programs, String> {
+    let elf = workspace::root().join("target/firmware/f350.elf");
+    if !elf.exists() {
+        firmware::run(&["f350"])?;
+    }
     for arguments in [
-        ["build", "--locked", "--package", "stspp-e2e-guest", "--bin", "guest-init"],
-        ["build", "--locked", "--package", "stspp-hil-sim", "--example", "usbip_cameras"],
+        &["build", "--locked", "--package", "stspp-e2e-guest", "--package", "stspp-hil-serve"][..],
+        &["build", "--locked", "--package", "stspp", "--bin", "stspp"],
+        &["build", "--locked", "--package", "stspp", "--example", "cloud_against_truth"],
     ] {
         let status = workspace::cargo().args(arguments).status();
         if !status.is_ok_and(|s| s.success()) {
             return Err(format!("cargo {} failed", arguments.join(" ")));
         }
     }
-    let built = workspace::root().join("target/debug");
-    Ok((built.join("guest-init"), built.join("examples/usbip_cameras")))
+    Ok(Programs { transports: test_binary("stspp", "transports")? })
 }
 
-/// The camera server as a process of its own; ended when dropped.
-struct CameraServer {
-    process: Child,
-    port: u16,
-}
-
-impl CameraServer {
-    fn start(program: &PathBuf) -> Result<Self, String> {
-        let mut process = Command::new(program)
-            .arg("0")
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .map_err(|e| format!("{}: {e}", program.display()))?;
-        let mut line = String::new();
-        if let Some(stdout) = process.stdout.take() {
-            let _ = BufReader::new(stdout).read_line(&mut line);
-        }
-        let mut server = Self { process, port: 0 };
-        server.port = line.trim().parse().map_err(|_| "the camera server did not start")?;
-        Ok(server)
-    }
-}
-
-impl Drop for CameraServer {
-    fn drop(&mut self) {
-        let _ = self.process.kill();
-        let _ = self.process.wait();
-    }
+/// Builds an integration test and says where its program is.
+fn test_binary(package: &str, test: &str) -> Result<PathBuf, String> {
+    let mut command: Command = workspace::cargo();
+    command.args(["test", "--locked", "--no-run", "--message-format=json", "--package", package]);
+    let output = command
+        .args(["--test", test])
+        .stderr(std::process::Stdio::inherit())
+        .output()
+        .map_err(|e| format!("cargo test: {e}"))?;
+    String::from_utf8_lossy(&output.stdout)
+        .lines()
+        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+        .filter(|message| message["target"]["name"] == test)
+        .find_map(|message| Some(PathBuf::from(message["executable"].as_str()?)))
+        .ok_or_else(|| format!("cargo built no test {test}"))
 }

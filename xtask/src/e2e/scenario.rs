@@ -98,7 +98,8 @@ fn doctor(bench: &mut Bench) -> Result<String, String> {
 const PERIOD_US: &str = "65000";
 
 fn timing(bench: &mut Bench) -> Result<String, String> {
-    let set = ["timing", "set", "--json", "--source", "usb:", "--defaults", "--period-us", PERIOD_US];
+    let set =
+        ["timing", "set", "--json", "--source", "usb:", "--defaults", "--period-us", PERIOD_US];
     let set = bench.stspp_json(30, &set)?;
     let got = bench.stspp_json(30, &["timing", "get", "--json", "--source", "usb:"])?;
     let timing = |json: &Value| json.get("timing").unwrap_or(json).clone();
@@ -115,16 +116,18 @@ fn timing(bench: &mut Bench) -> Result<String, String> {
 fn camera_controls(bench: &mut Bench) -> Result<String, String> {
     let bright = |bench: &mut Bench, options: &str| -> Result<f64, String> {
         let source = format!("{}&{options}", bench.source());
-        let out = ["record", "/tmp/brightness", "--force", "--json", "--source", &source, "-n", "2"];
-        bench.stspp_ok(60, &out)?;
-        let picture = bench.file("/tmp/brightness/left/00.png")?;
-        super::bench::mean_of_png(&picture)
+        let words = ["stream", "--pairs", "--json", "--source", &source, "-n", "4"];
+        let text = bench.stspp_ok(60, &words)?;
+        let pair = text.lines().rfind(|line| line.contains("mean_grey")).unwrap_or_default();
+        let json: Value = serde_json::from_str(pair).map_err(|e| format!("{e}: {text}"))?;
+        json["mean_grey"][0].as_f64().ok_or_else(|| format!("no grey value: {json}"))
     };
     let full = bright(bench, "exposure_us=100000&gain=100")?;
     let short = bright(bench, "exposure_us=4000&gain=100")?;
     let gained = bright(bench, "exposure_us=4000&gain=400")?;
     // The default exposure is 32 ms: an eighth of the light, then four times its numbers.
-    let told = format!("mean grey {full:.1}, {short:.1} at 1/8 of the exposure, {gained:.1} at gain 4");
+    let told =
+        format!("mean grey {full:.1}, {short:.1} at 1/8 of the exposure, {gained:.1} at gain 4");
     if short < 0.35 * full && gained > 2.0 * short { Ok(told) } else { Err(told) }
 }
 
@@ -151,7 +154,11 @@ fn add_up(stats: &Value) -> Result<(), String> {
         .map_or(0, |causes| causes.values().filter_map(Value::as_u64).sum());
     let given = number(stats, "/frames_left") + number(stats, "/frames_right");
     let found = 2 * number(stats, "/pairs") + rejected + number(stats, "/dropped_capture");
-    if given == found { Ok(()) } else { Err(format!("{given} frames, {found} accounted for: {stats}")) }
+    if given == found {
+        Ok(())
+    } else {
+        Err(format!("{given} frames, {found} accounted for: {stats}"))
+    }
 }
 
 fn pairs(bench: &mut Bench) -> Result<String, String> {
@@ -185,7 +192,8 @@ fn depth(bench: &mut Bench) -> Result<String, String> {
 fn busy(bench: &mut Bench) -> Result<String, String> {
     // One process holds the device while another asks for it.
     let source = bench.source();
-    let arguments = ["run", "30", "/bin/stspp", "stream", "--pairs", "--source", &source, "-n", "60"];
+    let arguments =
+        ["run", "30", "/bin/stspp", "stream", "--pairs", "--source", &source, "-n", "60"];
     bench.machine.send(&arguments)?;
     bench.wait_lit()?;
     let reply = bench.side(&["run", "20", "/bin/stspp", "info", "--source", "usb:"])?;

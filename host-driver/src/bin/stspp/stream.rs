@@ -156,7 +156,12 @@ fn pairs(
         *shown += 1;
         if output.json {
             let delay_ms = pair.arrival_delay.as_secs_f64() * 1e3;
-            println!("{}", json!({ "label": pair.label, "arrival_delay_ms": delay_ms }));
+            let line = json!({
+                "label": pair.label,
+                "arrival_delay_ms": delay_ms,
+                "mean_grey": [pair.left.mean_grey(), pair.right.mean_grey()],
+            });
+            println!("{line}");
         } else {
             let stats = stream.stats();
             live.set_message(format!(
