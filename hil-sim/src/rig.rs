@@ -5,6 +5,8 @@
 //! how fast: as a consumer takes frames, or as a wall clock says.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::device::{Controller, Line, PinEdge};
 use crate::world::{Camera, LightInterval, LightSource};
@@ -60,6 +62,7 @@ pub struct Rig {
     cameras: [CameraState; 2],
     inbox: Vec<u8>,
     watch: Option<Vec<PinEdge>>,
+    backlog: Arc<AtomicUsize>,
 }
 
 /// Read-out time of a camera of so many pixels.
@@ -90,6 +93,7 @@ impl Rig {
             cameras: Default::default(),
             inbox: Vec::new(),
             watch: None,
+            backlog: Arc::default(),
         }
     }
 
@@ -150,6 +154,7 @@ impl Rig {
         let state = &mut self.cameras[index(camera)];
         let longest_ns = state.longest_ns;
         *state = CameraState { longest_ns, ..CameraState::default() };
+        self.count_backlog();
     }
 
     /// Ends a camera's exposures after this time even while its trigger stays high.
@@ -166,7 +171,21 @@ impl Rig {
     /// Takes the oldest exposure of a camera that is read out.
     pub fn take_ready(&mut self, camera: Camera) -> Option<Exposure> {
         let now_ns = self.now_ns();
-        self.cameras[index(camera)].frames.pop_front_if(|frame| frame.ready_ns <= now_ns)
+        let taken = self.cameras[index(camera)].frames.pop_front_if(|f| f.ready_ns <= now_ns);
+        self.count_backlog();
+        taken
+    }
+
+    /// Exposures that wait to be fetched, of the camera that has more of them. Kept up to date for who
+    /// does not hold the rig.
+    #[must_use]
+    pub fn backlog(&self) -> Arc<AtomicUsize> {
+        Arc::clone(&self.backlog)
+    }
+
+    fn count_backlog(&self) {
+        let most = self.cameras.iter().map(|camera| camera.frames.len()).max().unwrap_or(0);
+        self.backlog.store(most, Ordering::Relaxed);
     }
 
     /// The camera whose oldest exposure was read out first, if one is.
@@ -194,6 +213,7 @@ impl Rig {
             }
         }
         self.edges = edges;
+        self.count_backlog();
         self.controller.host_read(&mut self.inbox);
     }
 

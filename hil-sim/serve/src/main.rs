@@ -1,10 +1,11 @@
 //! `hil-sim serve --usbip`: the simulated sensor as USB devices that a Linux machine attaches.
 //!
-//! [`sensor`] puts controller, light, cameras and USB devices together; [`console`] lets its user pull
-//! cables and inject faults; [`calibration`] writes what a host needs to know of the cameras.
+//! [`sensor`] puts controller, light, cameras and USB devices together; [`pace`] says how fast its time
+//! passes; [`console`] lets its user pull cables and inject faults; [`calibration`] writes what a host needs to know of the cameras.
 
 mod calibration;
 mod console;
+mod pace;
 mod sensor;
 
 use std::io::{BufRead, Write};
@@ -59,6 +60,10 @@ pub struct Serve {
     /// The firmware's ELF [default: that of `cargo xtask firmware`].
     #[arg(long, value_name = "FILE")]
     firmware: Option<PathBuf>,
+    /// Let the sensor's time pass more slowly while the host is behind with fetching pictures: nothing is
+    /// lost on a machine that is too slow, such as an emulated one.
+    #[arg(long)]
+    patient: bool,
     /// Write the cameras' calibration (camchain.yaml) here and go on.
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,

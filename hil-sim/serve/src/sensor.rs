@@ -1,7 +1,6 @@
 //! The simulated sensor as three USB devices: control interface, left camera, right camera.
 
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
 
 use stspp_hil_mcu::controller::{McuController, firmware_elf};
 use stspp_hil_mcu::front::{SharedController, UsbPort, share};
@@ -22,6 +21,7 @@ use stspp_protocol::timing::ProjectionTiming;
 use stspp_protocol::usb as ids;
 
 use crate::console::{Chip, Console};
+use crate::pace::{self, Backlog};
 use crate::{Mcu, Serve};
 
 /// Exposures that a camera keeps for a host that is slow: a few, as cameras do.
@@ -44,6 +44,7 @@ pub struct Sensor {
     bank: Arc<FrameBank>,
     control: Control,
     clock: Clock,
+    backlog: Backlog,
 }
 
 impl Sensor {
@@ -62,10 +63,8 @@ impl Sensor {
         let model = if serve.scale > 1 { model.scaled_down(serve.scale) } else { model };
         let world = Arc::new(World::new(&SceneSpec::parse(name, &options)?, model)?);
         let (control, booted_ns) = control(serve)?;
-        let start = Instant::now();
-        let clock: Clock = Arc::new(move || {
-            booted_ns + u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX / 2)
-        });
+        let backlog = Backlog::default();
+        let clock = pace::clock(booted_ns, serve.patient, Arc::clone(&backlog));
         let control = match control {
             Unclocked::Emulated(controller) => {
                 let (shared, port) =
@@ -75,7 +74,7 @@ impl Sensor {
             Unclocked::InProcess(device, serial) => Control::InProcess(device, serial),
         };
         let bank = Arc::new(FrameBank::new(Arc::clone(&world)));
-        Ok(Self { world, bank, control, clock })
+        Ok(Self { world, bank, control, clock, backlog })
     }
 
     /// Scene and cameras.
@@ -108,8 +107,12 @@ impl Sensor {
         let model = self.world.model();
         let pixels = model.left.width * model.left.height;
         let cables = [Cable::default(), Cable::default(), Cable::default()];
-        let rig =
-            |controller: Box<dyn Controller>| Rig::new(controller, readout_ns(pixels), FRAMES_KEPT);
+        let backlog = self.backlog;
+        let rig = |controller: Box<dyn Controller>| {
+            let rig = Rig::new(controller, readout_ns(pixels), FRAMES_KEPT);
+            backlog.get_or_init(|| rig.backlog());
+            rig
+        };
         let (bench, chip, control): (_, _, Arc<Mutex<dyn UsbFunction>>) = match self.control {
             Control::Emulated(port, shared) => {
                 let bench = Bench::following(rig(Box::new(shared.clone())), self.clock);

@@ -158,12 +158,6 @@ impl World {
         Truth::new(self)
     }
 
-    /// Whether nothing moves.
-    #[must_use]
-    pub fn is_still(&self) -> bool {
-        self.scene.is_still()
-    }
-
     /// Name of an object, such as "sphere".
     ///
     /// # Panics

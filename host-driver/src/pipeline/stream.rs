@@ -281,7 +281,11 @@ fn start_pairs(
             let period_us = session
                 .timing(started.timing_generation)
                 .map_or(33_333, |timing| timing.frame_period_us);
-            let config = PairerConfig::new(period_us, started.first_frame_sequence);
+            let mut config = PairerConfig::new(period_us, started.first_frame_sequence);
+            // Who allows more time than usual has a slow machine: its frames take longer, too.
+            let usual = StreamOptions::default().timeout;
+            let more_ns = duration_ns(options.timeout.saturating_sub(usual)) / 10;
+            config.patience_ns = config.patience_ns.max(more_ns);
             let capture = Capture {
                 session: Arc::clone(&session),
                 progress: Arc::clone(&progress),

@@ -241,8 +241,10 @@ impl<F> Pairer<F> {
 
     /// Goes on with triggers every `period_us`: a new timing took effect.
     pub fn set_period_us(&mut self, period_us: u32) {
-        let first_sequence = self.config.first_sequence;
-        self.config = PairerConfig { first_sequence, ..PairerConfig::new(period_us, 0) };
+        let PairerConfig { first_sequence, patience_ns, .. } = self.config;
+        let new = PairerConfig::new(period_us, 0);
+        let patience_ns = new.patience_ns.max(patience_ns);
+        self.config = PairerConfig { first_sequence, patience_ns, ..new };
     }
 
     /// Takes a trigger event.

@@ -14,6 +14,9 @@ use crate::workspace;
 /// whose emulated processor takes twenty times as long as a real one.
 pub const SCENE_SCALE: u32 = 2;
 
+/// What the guest's programs wait for a result: its processor is emulated.
+pub const TIMEOUT_S: &str = "20";
+
 /// Where the guest finds the cameras' calibration.
 pub const CALIBRATION: &str = "etc/stspp/camchain.yaml";
 
@@ -151,7 +154,7 @@ impl Bench {
     pub fn start_stream(&mut self, count: &str, more: &[&str]) -> Result<(), String> {
         let source = self.source();
         let mut words = vec!["run", "60", "/bin/stspp", "stream", "--pairs", "--json"];
-        words.extend(["--source", &source, "-n", count]);
+        words.extend(["--timeout", TIMEOUT_S, "--source", &source, "-n", count]);
         words.extend(more);
         self.machine.send(&words)
     }

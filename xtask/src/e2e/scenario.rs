@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::bench::{Bench, SCENE_SCALE};
+use super::bench::{Bench, SCENE_SCALE, TIMEOUT_S};
 
 /// A scenario's name, and what runs it: what was seen, or what was wrong.
 pub type Scenario = (&'static str, fn(&mut Bench) -> Result<String, String>);
@@ -116,7 +116,8 @@ fn timing(bench: &mut Bench) -> Result<String, String> {
 fn camera_controls(bench: &mut Bench) -> Result<String, String> {
     let bright = |bench: &mut Bench, options: &str| -> Result<f64, String> {
         let source = format!("{}&{options}", bench.source());
-        let words = ["stream", "--pairs", "--json", "--source", &source, "-n", "4"];
+        let words =
+            ["stream", "--pairs", "--json", "--timeout", TIMEOUT_S, "--source", &source, "-n", "4"];
         let text = bench.stspp_ok(60, &words)?;
         let pair = text.lines().rfind(|line| line.contains("mean_grey")).unwrap_or_default();
         let json: Value = serde_json::from_str(pair).map_err(|e| format!("{e}: {text}"))?;
@@ -134,7 +135,8 @@ fn camera_controls(bench: &mut Bench) -> Result<String, String> {
 /// Streams `count` raw pairs; the counters at the end, after they were found to add up.
 fn stream(bench: &mut Bench, count: &str) -> Result<Value, String> {
     let source = bench.source();
-    let arguments = ["stream", "--pairs", "--json", "--source", &source, "-n", count];
+    let arguments =
+        ["stream", "--pairs", "--json", "--timeout", TIMEOUT_S, "--source", &source, "-n", count];
     let text = bench.stspp_ok(60, &arguments)?;
     let last = text.lines().rfind(|line| line.contains("\"stats\"")).unwrap_or_default();
     let json: Value = serde_json::from_str(last).map_err(|e| format!("{e}: {text}"))?;
@@ -170,7 +172,17 @@ fn pairs(bench: &mut Bench) -> Result<String, String> {
 
 fn depth(bench: &mut Bench) -> Result<String, String> {
     let source = bench.source();
-    let arguments = ["capture", "--force", "--json", "--source", &source, "--out", "/tmp/depth"];
+    let arguments = [
+        "capture",
+        "--force",
+        "--json",
+        "--timeout",
+        "60",
+        "--source",
+        &source,
+        "--out",
+        "/tmp/depth",
+    ];
     bench.stspp_ok(150, &arguments)?;
     let cloud = bench.file("/tmp/depth/cloud.ply")?;
     let guest = bench.score("guest", &cloud)?;
@@ -192,8 +204,19 @@ fn depth(bench: &mut Bench) -> Result<String, String> {
 fn busy(bench: &mut Bench) -> Result<String, String> {
     // One process holds the device while another asks for it.
     let source = bench.source();
-    let arguments =
-        ["run", "30", "/bin/stspp", "stream", "--pairs", "--source", &source, "-n", "60"];
+    let arguments = [
+        "run",
+        "30",
+        "/bin/stspp",
+        "stream",
+        "--pairs",
+        "--timeout",
+        TIMEOUT_S,
+        "--source",
+        &source,
+        "-n",
+        "20",
+    ];
     bench.machine.send(&arguments)?;
     bench.wait_lit()?;
     let reply = bench.side(&["run", "20", "/bin/stspp", "info", "--source", "usb:"])?;

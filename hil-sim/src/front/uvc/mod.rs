@@ -2,8 +2,8 @@
 //! driver takes it.
 //!
 //! [`descriptors`] is what it says of itself, [`controls`] are its settings, [`payload`] the bytes
-//! that a frame becomes. Frames come from a [`FrameSource`]; a frame that the host does not fetch in
-//! time is lost, as on hardware.
+//! that a frame becomes. Frames come from a [`FrameSource`], which keeps a few for a host that is slow
+//! and loses others, as on hardware.
 
 pub mod controls;
 pub mod descriptors;
@@ -59,7 +59,6 @@ pub struct UvcCamera<S> {
     sending: Option<Payload>,
     waiting: Option<Frame>,
     toggle: bool,
-    lost: u64,
 }
 
 impl<S: FrameSource> UvcCamera<S> {
@@ -75,13 +74,7 @@ impl<S: FrameSource> UvcCamera<S> {
             sending: None,
             waiting: None,
             toggle: false,
-            lost: 0,
         }
-    }
-
-    /// Frames that the host did not fetch in time while it was streaming.
-    pub fn frames_lost(&self) -> u64 {
-        self.lost
     }
 
     /// Where the frames come from.
@@ -192,10 +185,10 @@ impl<S: FrameSource> UsbFunction for UvcCamera<S> {
     }
 
     fn poll(&mut self) {
-        while let Some(frame) = self.source.poll(self.controls.settings()) {
-            if self.streaming && self.waiting.replace(frame).is_some() {
-                self.lost += 1;
-            }
+        // One frame is on its way and one waits: further ones stay with the source, which loses those
+        // that it has no room for.
+        if self.streaming && self.waiting.is_none() {
+            self.waiting = self.source.poll(self.controls.settings());
         }
     }
 }

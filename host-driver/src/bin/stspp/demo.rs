@@ -47,11 +47,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let begun = Instant::now();
     // Found out before the work: whether the output can be written at all.
     let mut out = OutputFolder::create(&args.out, true).map_err(|e| output_failure(&e))?;
-    let source = Source { uri: format!("sim:{}", args.scene), timing: args.timing.clone() };
+    let source = Source::new(format!("sim:{}", args.scene), args.timing.clone());
     let progress = output.spinner();
     progress.set_message("building the scene");
     let (mut sensor, world) = source.open_sim()?;
-    let options = stream_options(&args.matching);
+    let options = stream_options(None, Some(&args.matching));
     let mut stream = sensor.stream_with(&options).map_err(|e| failure(&e))?;
     interrupt::stops(stream.stop_handle());
     let frame = stream.next_observed(|stats| {

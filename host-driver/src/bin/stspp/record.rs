@@ -7,12 +7,12 @@ use serde_json::json;
 use stspp::calibration::kalibr;
 use stspp::export::folder::OutputFolder;
 use stspp::recording::labels::{self, FramesInfo};
-use stspp::{Sensor, SlotLabel, SourceUri, StreamOptions, image_io};
+use stspp::{Sensor, SlotLabel, SourceUri, image_io};
 
 use crate::exit::{Failure, Kind};
 use crate::interrupt;
 use crate::output::Output;
-use crate::source::{Source, failure, output_failure};
+use crate::source::{Source, failure, output_failure, stream_options};
 
 /// Record raw stereo pairs: camchain.yaml, left/, right/ and frames.json.
 ///
@@ -53,7 +53,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         out.file("camchain.yaml", |w| w.write_all(text.as_bytes()))
             .map_err(|e| output_failure(&e))?;
     }
-    let mut stream = sensor.pairs(&StreamOptions::default()).map_err(|e| failure(&e))?;
+    let mut stream =
+        sensor.pairs(&stream_options(Some(&args.source), None)).map_err(|e| failure(&e))?;
     interrupt::stops(stream.stop_handle());
     let digits = (count - 1).to_string().len().max(2);
     let progress = output.progress(count as u64, "recording");

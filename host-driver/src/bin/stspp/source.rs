@@ -1,6 +1,7 @@
 //! Opening a source, and what its errors mean for the exit code.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use stspp::export::folder::OutputError;
 use stspp::{Error, ProjectionTiming, Sensor, StreamOptions, timing};
@@ -18,9 +19,21 @@ pub struct Source {
     /// Projection timing to set first: a JSON file as `timing get --json` prints it.
     #[arg(long, value_name = "FILE")]
     pub timing: Option<PathBuf>,
+    /// Without a result for so long, the part that is silent is named. A machine that is slow needs more;
+    /// frames are waited for longer then, too.
+    #[arg(long, value_name = "SECONDS", default_value_t = TIMEOUT_S)]
+    pub timeout: f64,
 }
 
+/// Seconds after which silence is reported.
+const TIMEOUT_S: f64 = 3.0;
+
 impl Source {
+    /// A source with the usual timeout.
+    pub fn new(uri: String, timing: Option<PathBuf>) -> Self {
+        Self { uri, timing, timeout: TIMEOUT_S }
+    }
+
     /// Opens it and sets the timing, if one is given.
     pub fn open(&self) -> Result<Sensor, Failure> {
         let mut sensor = Sensor::open(&self.uri).map_err(|e| failure(&e))?;
@@ -41,9 +54,14 @@ pub fn read_timing(path: &Path) -> Result<ProjectionTiming, Failure> {
     timing::from_json(&bare).map_err(|error| wrong(error.to_string()))
 }
 
-/// Stream options of the matching flags.
-pub fn stream_options(matching: &Matching) -> StreamOptions {
-    StreamOptions { matching: matching.options(), ..StreamOptions::default() }
+/// Stream options of the flags; a recording needs no source's.
+pub fn stream_options(source: Option<&Source>, matching: Option<&Matching>) -> StreamOptions {
+    let defaults = StreamOptions::default();
+    let timeout = source.and_then(|s| Duration::try_from_secs_f64(s.timeout).ok());
+    StreamOptions {
+        matching: matching.map_or(defaults.matching.clone(), Matching::options),
+        timeout: timeout.filter(|timeout| !timeout.is_zero()).unwrap_or(defaults.timeout),
+    }
 }
 
 /// The failure that an error of the library is.

@@ -60,9 +60,15 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     loop {
         let left = args.count.map(|count| count - shown);
         let outcome = if args.pairs {
-            pairs(&mut sensor, left, &mut shown, output)
+            pairs(&mut sensor, &args.source, left, &mut shown, output)
         } else {
-            show(&mut sensor, &args.matching, left, &mut shown, output)
+            show(
+                &mut sensor,
+                &stream_options(Some(&args.source), Some(&args.matching)),
+                left,
+                &mut shown,
+                output,
+            )
         };
         let Err(End::Lost(error)) = outcome else { return outcome.map_err(End::into_failure) };
         if wait.is_zero() {
@@ -122,11 +128,12 @@ fn resume(sensor: &mut Sensor, wait: Duration) -> Result<(), Failure> {
 /// Shows raw pairs.
 fn pairs(
     sensor: &mut Sensor,
+    source: &Source,
     count: Option<u64>,
     shown: &mut u64,
     output: &Output,
 ) -> Result<(), End> {
-    let mut stream = sensor.pairs(&stspp::StreamOptions::default()).map_err(End::of)?;
+    let mut stream = sensor.pairs(&stream_options(Some(source), None)).map_err(End::of)?;
     interrupt::stops(stream.stop_handle());
     let live = output.spinner();
     let begun = Instant::now();
@@ -186,18 +193,18 @@ fn pairs(
 pub fn play(args: &PlayArgs, output: &Output) -> Result<(), Failure> {
     let source = stspp::SourceUri::Replay { folder: args.folder.clone(), options: Vec::new() };
     let mut sensor = Sensor::open_uri(&source).map_err(|e| failure(&e))?;
-    show(&mut sensor, &args.matching, args.count, &mut 0, output).map_err(End::into_failure)
+    show(&mut sensor, &stream_options(None, Some(&args.matching)), args.count, &mut 0, output)
+        .map_err(End::into_failure)
 }
 
 fn show(
     sensor: &mut Sensor,
-    matching: &Matching,
+    options: &stspp::StreamOptions,
     count: Option<u64>,
     shown: &mut u64,
     output: &Output,
 ) -> Result<(), End> {
-    let options = stream_options(matching);
-    let mut stream = sensor.stream_with(&options).map_err(End::of)?;
+    let mut stream = sensor.stream_with(options).map_err(End::of)?;
     interrupt::stops(stream.stop_handle());
     let live = output.spinner();
     let begun = Instant::now();
