@@ -3,8 +3,16 @@
 use std::time::Duration;
 
 use stspp::Sensor;
-use stspp_hil_mcu::controller::firmware_elf;
+use stspp_hil_mcu::controller::{McuController, firmware_elf};
 use stspp_hil_mcu::soc::Variant;
+
+/// What a fresh clone says, where the firmware has not been built.
+#[test]
+fn a_missing_image_names_the_command_that_builds_it() {
+    let missing = std::path::Path::new("/nowhere/f350.elf");
+    let Err(error) = McuController::load(Variant::F350, missing) else { panic!("loaded nothing") };
+    assert!(error.to_string().contains("cargo xtask firmware"), "{error}");
+}
 
 #[test]
 fn depth_streams_from_the_emulated_binary() {

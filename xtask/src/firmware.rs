@@ -7,6 +7,7 @@
 //! `-Z build-std` builds it.
 
 mod elf;
+mod flash;
 mod toolchain;
 
 use crate::stage::{self, Outcome};
@@ -44,6 +45,9 @@ pub struct Image {
 /// # Errors
 /// Says what is missing or over budget, and what to do about it.
 pub fn run(arguments: &[&str]) -> Result<String, String> {
+    if let ["flash", rest @ ..] = arguments {
+        return flash::run(rest);
+    }
     let (mut install, mut test, mut exercise, mut boards) = (false, false, false, Vec::new());
     for &argument in arguments {
         match argument {
@@ -55,6 +59,7 @@ pub fn run(arguments: &[&str]) -> Result<String, String> {
                 return Err(format!(
                     "firmware: unknown argument `{other}`\n\
                      cargo xtask firmware [f330] [f350] [--install] [--exercise] [--test]\n\
+                     cargo xtask firmware flash f330|f350 [--check] [ELF]\n\
                      --install   gets the compiler's target (rustup, or Debian packages as root)\n\
                      --exercise  also builds the program that the HAL's emulator tests run\n\
                      --test      instead runs the host tests of the HAL's arithmetic"
@@ -69,6 +74,12 @@ pub fn run(arguments: &[&str]) -> Result<String, String> {
         boards.extend(BOARDS);
     }
     build_all(&toolchain::find(install)?, &boards, exercise)
+}
+
+/// Whether both boards' images have been built.
+pub fn images_are_there() -> bool {
+    let folder = workspace::root().join("target/firmware");
+    BOARDS.iter().all(|board| folder.join(format!("{board}.elf")).exists())
 }
 
 /// Both boards as a stage of the test command: skipped only where no compiler can be had.

@@ -16,9 +16,11 @@ cargo xtask test [--quick]   everything that is proven: formatting, lints, depen
                              licences, tests. --quick leaves out the stages that need Debian packages
 cargo xtask arrows           check which crate may depend on which
 cargo xtask licences         check the licences of everything that ships against deny.toml
-cargo xtask firmware [f330] [f350] [--install] [--test]
+cargo xtask firmware [f330] [f350] [--install] [--exercise] [--test]
                              builds the firmware, prints flash and RAM, fails over budget;
                              --install gets the compiler's target, --test runs its host tests
+cargo xtask firmware flash f330|f350 [--check] [ELF]
+                             checks an image and writes it with a debug probe (probe-rs)
 cargo xtask e2e [NAME]       plugs the simulated sensor into a Debian kernel in QEMU and tries the
                              stspp binary there: all scenarios, or those with NAME in their name
 cargo xtask help             this text";

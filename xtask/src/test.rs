@@ -52,6 +52,21 @@ pub fn run(depth: Depth) -> ExitCode {
             Depth::Quick => Outcome::Skipped("left out by --quick".into()),
             Depth::Full => firmware::stage(),
         }),
+        stage::run("emulated sensor", || match depth {
+            Depth::Quick => Outcome::Skipped("left out by --quick".into()),
+            Depth::Full if !firmware::images_are_there() => {
+                Outcome::Skipped("there is no firmware to run: see the stage before".into())
+            }
+            Depth::Full => stage::command(cargo(&[
+                "test",
+                "--locked",
+                "--package=stspp",
+                "--features=mcu",
+                "--test=emulated_chip",
+                "--",
+                "--nocapture",
+            ])),
+        }),
         stage::run("tests", || {
             stage::command(cargo(&["test", "--locked", "--workspace", "--no-fail-fast"]))
         }),
