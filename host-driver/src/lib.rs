@@ -57,4 +57,5 @@ pub use error::Error;
 pub use pipeline::{DepthStream, LabelledPair, PairStream, StreamOptions, StreamStats};
 pub use sensor::{Sensor, SensorInfo};
 pub use stspp_protocol::timing::{ProjectionTiming, Slot};
+pub use stspp_protocol::trigger::{ExternalTrigger, TriggerEdge, TriggerInput, TriggerSource};
 pub use uri::{SourceUri, UriError};

@@ -3,7 +3,8 @@
 
 use std::time::Duration;
 
-use stspp::{DepthFrame, Error, ProjectionTiming, Sensor, Slot};
+use stspp::{DepthFrame, Error, ProjectionTiming, Sensor, Slot, StreamOptions};
+use stspp::{ExternalTrigger, TriggerInput, TriggerSource};
 
 fn median_depth_m(frame: &DepthFrame) -> f32 {
     let mut depths: Vec<f32> =
@@ -180,4 +181,24 @@ fn at_wall_pace_a_slow_machine_skips_windows_and_says_so() {
         2 * stats.pairs + stats.rejected.total() + stats.dropped_capture,
         "{stats:?}"
     );
+}
+
+#[test]
+fn an_external_trigger_is_waited_for() {
+    let mut sensor = Sensor::open("sim:plane?scale=16").unwrap();
+    assert_eq!(sensor.trigger_input().unwrap(), TriggerInput::default());
+    let late = ExternalTrigger { delay_us: 5_000, ..ExternalTrigger::default() };
+    let refused = sensor.set_trigger_source(TriggerSource::External(late)).unwrap_err();
+    assert!(refused.to_string().contains("delay_us is 5000; allowed is 60..=900"), "{refused}");
+    let source = TriggerSource::External(ExternalTrigger::default());
+    sensor.set_trigger_source(source).unwrap();
+    assert_eq!(sensor.trigger_input().unwrap().source, source);
+    // Nothing is wired to the simulated input: no trigger, no frame.
+    let mut stream = sensor.pairs(&StreamOptions::default()).unwrap();
+    let error = stream.next_timeout(Duration::from_millis(300)).unwrap_err();
+    assert!(matches!(error, Error::Timeout { .. }), "{error:?}");
+    drop(stream);
+    sensor.set_trigger_source(TriggerSource::FreeRunning).unwrap();
+    let mut stream = sensor.pairs(&StreamOptions::default()).unwrap();
+    stream.next_timeout(Duration::from_secs(5)).unwrap();
 }

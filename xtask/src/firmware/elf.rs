@@ -64,7 +64,7 @@ pub fn flash_segments(bytes: &[u8]) -> Result<Vec<(u64, u64)>, String> {
 
 /// Whether the symbol table has `name`; no table is a table without it.
 pub fn has_symbol(bytes: &[u8], name: &str) -> bool {
-    symbol_names(bytes).is_ok_and(|names| names.iter().any(|found| *found == name.as_bytes()))
+    symbol_names(bytes).is_ok_and(|names| names.contains(&name.as_bytes()))
 }
 
 fn symbol_names(bytes: &[u8]) -> Result<Vec<&[u8]>, String> {
