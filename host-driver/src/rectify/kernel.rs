@@ -1,6 +1,6 @@
 //! Interpolation kernels as tables of fixed-point taps.
 
-use std::sync::Arc;
+use std::sync::OnceLock;
 
 /// Taps of a kernel: the samples from 3 before to 4 after the integer position.
 pub(super) const TAPS: usize = 8;
@@ -9,8 +9,8 @@ pub(super) const TAPS_BEFORE: usize = 3;
 /// Steps of the sub-pixel position: 2^10. Where the rectified scale is close to 1, neighbouring pixels
 /// share their rounding, so the step itself (+-0.0005 px) bounds the systematic shift.
 pub(super) const PHASE_BITS: u32 = 10;
-/// A tap of 1 in fixed point.
-const ONE: f64 = 16_384.0;
+/// As a count.
+pub(super) const PHASES: usize = 1 << PHASE_BITS;
 
 /// How a rectified pixel is interpolated from the raw image.
 ///
@@ -44,18 +44,54 @@ impl Kernel {
         taps.iter_mut().for_each(|tap| *tap /= sum);
         taps
     }
+}
 
-    /// The taps for each phase.
-    pub(super) fn table(self) -> Arc<[[f64; TAPS]]> {
-        let phases = 1 << PHASE_BITS;
-        (0..phases).map(|phase| self.taps(f64::from(phase) / f64::from(phases))).collect()
+/// Fraction bits of the taps.
+pub(super) const TAP_BITS: u32 = 14;
+
+/// A kernel's taps for each phase, in fixed point per depth of a camera.
+#[derive(Debug)]
+pub(super) struct TapTables {
+    exact: Vec<[f64; TAPS]>,
+    plain: Vec<[i16; TAPS]>,
+    /// Made by the first image of a depth.
+    by_bits: [OnceLock<Vec<[i16; TAPS]>>; 17],
+}
+
+impl TapTables {
+    pub fn new(kernel: Kernel) -> Self {
+        let phases = (0..PHASES).map(|phase| phase as f64 / PHASES as f64);
+        let exact: Vec<_> = phases.map(|t| kernel.taps(t)).collect();
+        let plain = fixed_point(&exact, 1.0);
+        Self { exact, plain, by_bits: Default::default() }
+    }
+
+    /// Taps of sum 2^[`TAP_BITS`].
+    pub fn plain(&self) -> &[[i16; TAPS]] {
+        &self.plain
+    }
+
+    /// Taps that bring a camera's values to samples, whose full scale is 255 * 64 whatever the
+    /// camera's bits, and by how many bits their products are then shifted. Values of 16 bits must
+    /// be halved, to fit 16 bits with a sign.
+    pub fn from_camera(&self, bits: u32) -> (&[[i16; TAPS]], u32) {
+        if bits == 8 {
+            return (&self.plain, TAP_BITS - 6);
+        }
+        let used_bits = bits.clamp(1, 15);
+        let table = self.by_bits[bits.min(16) as usize].get_or_init(|| {
+            let full = f64::from((1_u32 << bits) - 1) / f64::from(1_u32 << (bits - used_bits));
+            let scale = 255.0 * 64.0 / full / 2_f64.powi(14 - used_bits as i32);
+            fixed_point(&self.exact, scale)
+        });
+        (table, used_bits)
     }
 }
 
 /// Fixed-point taps whose sum is 2^14 times `scale`, exactly: a flat grey stays flat whatever the
 /// phase.
-pub(super) fn fixed_point(table: &[[f64; TAPS]], scale: f64) -> Vec<[i16; TAPS]> {
-    let one = ONE * scale;
+fn fixed_point(table: &[[f64; TAPS]], scale: f64) -> Vec<[i16; TAPS]> {
+    let one = f64::from(1 << TAP_BITS) * scale;
     table
         .iter()
         .map(|exact| {

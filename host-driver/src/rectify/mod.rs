@@ -1,17 +1,18 @@
 //! Rectification of toed-in, distorted cameras onto canvases with corresponding rows.
 
 mod canvas;
-mod dot;
 mod kernel;
+mod resample;
 mod warp;
 
 use std::sync::Arc;
 
-use stspp_matcher::{DisparityRange, Image, Sample};
+use stspp_matcher::{DisparityRange, Image, Level, Sample};
 
 use crate::{RawImage, RectifiedGeometry, StereoCalibration};
 pub(crate) use canvas::rect_from_left;
 pub use kernel::Kernel;
+use kernel::TapTables;
 pub use warp::RectifyScratch;
 use warp::{Virtual, Warp};
 
@@ -135,8 +136,10 @@ impl Rectifier {
             geometry.rect_from_left * left_from_right,
             geometry.cx_right_px,
         );
-        let taps = kernel.table();
-        let (left, right) = (Warp::new(&left, &taps), Warp::new(&right, &taps));
+        let taps = Arc::new(TapTables::new(kernel));
+        // What the environment asks for in vain is the matcher's to report.
+        let level = Level::choose(None).unwrap_or_else(|_| Level::best());
+        let (left, right) = (Warp::new(level, &left, &taps), Warp::new(level, &right, &taps));
         let resolution_px = calibration.left.resolution_px;
         Ok(Self { geometry: Arc::new(geometry), disparity, resolution_px, left, right })
     }

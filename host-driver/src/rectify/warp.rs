@@ -2,24 +2,22 @@
 //!
 //! The two-dimensional warp is done as two one-dimensional ones (Catmull and Smith, 1980): first along
 //! the raw rows to the columns of the canvas, then along those columns to its rows. Each is exact for a
-//! continuous picture, so that 8 + 8 taps do what 8 x 8 would. The picture between the two is kept
-//! transposed, and both passes are the same loop over contiguous samples.
+//! continuous picture, so that 8 + 8 taps do what 8 x 8 would. Conversion from the camera's format is
+//! part of the first pass: a raw row is converted in the first-level cache, and its scale is in the
+//! taps.
 
 use std::sync::Arc;
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 use rayon::prelude::*;
-use stspp_matcher::{Image, Sample};
+use stspp_matcher::{Image, Level, Sample};
 
-use super::dot;
-use super::kernel::{PHASE_BITS, TAPS, TAPS_BEFORE, fixed_point};
+use super::kernel::{PHASE_BITS, TAP_BITS, TAPS, TAPS_BEFORE, TapTables};
+use super::resample::{BLOCK, Places, across, along};
 use crate::raw::RawPixels;
 use crate::{CameraIntrinsics, RawImage};
 
-/// Fraction bits of the taps.
-const TAP_BITS: u32 = 14;
-/// Canvas rows (or raw rows) that a task handles, so that a band of the transposed picture stays in
-/// the second-level cache.
+/// Rows that a task handles.
 const BAND: usize = 32;
 
 /// Positions of first taps in a padded line, in 2^-10 pixels.
@@ -27,23 +25,25 @@ type Position = u32;
 
 /// A virtual camera's view of a real one's image.
 pub(super) struct Warp {
-    /// Per canvas column and raw row: where in the (padded) raw row.
-    along_rows: Vec<Position>,
+    level: Level,
+    /// Per raw row and canvas column: where in the (padded) raw row.
+    along_rows: Places,
     /// Per canvas row and column: where in the (padded) column of the picture between.
-    along_columns: Vec<Position>,
+    along_columns: Places,
     raw_px: [usize; 2],
     canvas_px: [usize; 2],
     /// Non-zero where the camera saw.
     pub mask: Image<u8>,
-    exact_taps: Arc<[[f64; TAPS]]>,
-    /// Taps of sum 2^14.
-    taps: Vec<[i16; TAPS]>,
+    taps: Arc<TapTables>,
 }
 
 /// Working memory of a warp; any number of warps of any size can share one.
 #[derive(Debug, Default)]
 pub struct RectifyScratch {
+    /// The picture between the passes: raw rows, padded above and below, by canvas columns.
     between: Vec<i16>,
+    /// A raw row per band.
+    lines: Vec<i16>,
 }
 
 /// A virtual camera: where canvas pixels are on the real one.
@@ -83,7 +83,7 @@ fn position(at: f64, size: usize) -> Position {
 }
 
 impl Warp {
-    pub fn new(view: &Virtual, exact_taps: &Arc<[[f64; TAPS]]>) -> Self {
+    pub fn new(level: Level, view: &Virtual, taps: &Arc<TapTables>) -> Self {
         let raw_px = view.camera.resolution_px;
         let canvas_px = view.canvas_px;
         let ([raw_w, raw_h], [w, h]) = (raw_px, canvas_px);
@@ -110,92 +110,57 @@ impl Warp {
                 }
                 x_of_rows(&path, raw_w, x_of_row);
             });
-        let (along_columns, seen) = (transposed(&columns, h), transposed(&seen, h));
-        let mask = Image::from_vec(w, h, seen).unwrap_or_else(|| Image::new(w, h, 0));
-        let (exact_taps, taps) = (Arc::clone(exact_taps), fixed_point(exact_taps, 1.0));
-        Self { along_rows, along_columns, raw_px, canvas_px, mask, exact_taps, taps }
+        let mask = Image::from_vec(w, h, transposed(&seen, h)).unwrap_or_else(|| Image::new(w, h, 0));
+        Self {
+            level: level.usable(),
+            along_rows: Places::new(&transposed(&along_rows, raw_h), w),
+            along_columns: Places::new(&transposed(&columns, h), w),
+            raw_px,
+            canvas_px,
+            mask,
+            taps: Arc::clone(taps),
+        }
     }
 
     /// Resamples `raw`, whose size must be the calibration's, into `out`, whose size must be the
     /// canvas's.
     pub fn apply(&self, raw: &RawImage, out: &mut Image<Sample>, scratch: &mut RectifyScratch) {
         let ([raw_w, raw_h], [w, _]) = (self.raw_px, self.canvas_px);
-        let padded_h = raw_h + TAPS;
-        scratch.between.resize(w * padded_h, 0);
-        // Full scale is 255 * 64 whatever the camera's bits. 16 bits are halved to fit the taps' i16.
+        let stride = w.next_multiple_of(BLOCK);
+        let line_len = raw_w + TAPS;
+        scratch.between.resize(stride * (raw_h + TAPS), 0);
+        scratch.lines.resize(line_len * raw_h.div_ceil(BAND), 0);
         let bits = u32::from(raw.bits.clamp(1, 16));
-        let used_bits = bits.min(15);
-        let full = f64::from((1_u32 << bits) - 1) / f64::from(1_u32 << (bits - used_bits));
-        let scale = 255.0 * 64.0 / full / 2_f64.powi(14 - used_bits as i32);
-        let table;
-        let taps = if bits == 8 {
-            &self.taps
-        } else {
-            table = fixed_point(&self.exact_taps, scale);
-            &table
-        };
-        let shift = if bits == 8 { TAP_BITS - 6 } else { used_bits };
-        let lines = Lines { raw, width: raw_w, halve: bits > used_bits };
-        self.to_columns(&lines, taps, shift, &mut scratch.between);
-        self.to_rows(&scratch.between, out);
-    }
-
-    /// First pass: raw rows to canvas columns, transposed.
-    fn to_columns(&self, lines: &Lines<'_>, taps: &[[i16; TAPS]], shift: u32, between: &mut [i16]) {
-        let ([raw_w, raw_h], padded_h) = (self.raw_px, self.raw_px[1] + TAPS);
-        // All raw rows, padded and as i16, once; the tasks share them.
-        let stride = raw_w + TAPS;
-        let mut padded = vec![0_i16; stride * raw_h];
-        padded.par_chunks_mut(stride * BAND).enumerate().for_each(|(band, rows)| {
-            for (k, row) in rows.chunks_mut(stride).enumerate() {
-                lines.read(band * BAND + k, row);
-            }
-        });
-        between.par_chunks_mut(padded_h * BAND).enumerate().for_each(|(band, columns)| {
-            let along = &self.along_rows[band * BAND * raw_h..];
-            for (column, x_of_row) in columns.chunks_mut(padded_h).zip(along.chunks(raw_h)) {
-                let inner = &mut column[TAPS_BEFORE..TAPS_BEFORE + raw_h];
-                interpolate_all(&padded, stride, x_of_row, taps, shift, inner);
-                let (first, last) = (column[TAPS_BEFORE], column[TAPS_BEFORE + raw_h - 1]);
-                column[..TAPS_BEFORE].fill(first);
-                column[TAPS_BEFORE + raw_h..].fill(last);
-            }
-        });
-    }
-
-    /// Second pass: canvas columns to canvas rows.
-    fn to_rows(&self, between: &[i16], out: &mut Image<Sample>) {
-        let (w, padded_h) = (self.canvas_px[0], self.raw_px[1] + TAPS);
+        let (taps, shift) = self.taps.from_camera(bits);
+        let lines = Lines { raw, width: raw_w, halve: bits == 16 };
+        let inner = &mut scratch.between[TAPS_BEFORE * stride..][..raw_h * stride];
+        inner
+            .par_chunks_mut(stride * BAND)
+            .zip(scratch.lines.par_chunks_mut(line_len))
+            .enumerate()
+            .for_each(|(band, (rows, line))| {
+                for (k, out) in rows.chunks_mut(stride).enumerate() {
+                    let y = band * BAND + k;
+                    lines.read(y, line);
+                    along(self.level, line, self.along_rows.row(y), taps, shift, out);
+                }
+            });
+        // Beyond its ends, the first and the last row repeat.
+        let between = &mut scratch.between;
+        let end = TAPS_BEFORE + raw_h;
+        for y in 0..TAPS_BEFORE {
+            between.copy_within(TAPS_BEFORE * stride..(TAPS_BEFORE + 1) * stride, y * stride);
+        }
+        for y in end..raw_h + TAPS {
+            between.copy_within((end - 1) * stride..end * stride, y * stride);
+        }
+        let taps = self.taps.plain();
         out.as_mut_slice().par_chunks_mut(w * BAND).enumerate().for_each(|(band, rows)| {
-            let along = &self.along_columns[band * BAND * w..];
-            for (row, y_of_u) in rows.chunks_mut(w).zip(along.chunks(w)) {
-                interpolate_all(between, padded_h, y_of_u, &self.taps, TAP_BITS, row);
+            for (k, out) in rows.chunks_mut(w).enumerate() {
+                let row = self.along_columns.row(band * BAND + k);
+                across(self.level, between, stride, row, taps, TAP_BITS, out);
             }
         });
-    }
-}
-
-/// Value k of `out` from line k of `lines` (each `stride` long) at position k.
-fn interpolate_all(
-    lines: &[i16],
-    stride: usize,
-    positions: &[Position],
-    taps: &[[i16; TAPS]],
-    shift: u32,
-    out: &mut [i16],
-) {
-    let at = |k: usize| {
-        let first = k * stride + (positions[k] >> PHASE_BITS) as usize;
-        let phase = (positions[k] & ((1 << PHASE_BITS) - 1)) as usize;
-        let samples = lines[first..].first_chunk().expect("lines are padded by the taps");
-        (samples, &taps[phase])
-    };
-    let (fours, rest) = out.as_chunks_mut::<4>();
-    for (k, four) in fours.iter_mut().enumerate() {
-        *four = dot::four([at(4 * k), at(4 * k + 1), at(4 * k + 2), at(4 * k + 3)], shift);
-    }
-    for (k, out) in rest.iter_mut().enumerate() {
-        *out = dot::one(at(4 * fours.len() + k), shift);
     }
 }
 
