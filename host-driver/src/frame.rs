@@ -74,7 +74,15 @@ impl DepthFrame {
 
     /// All valid pixels as points of the left camera's frame, row by row.
     pub fn point_cloud(&self) -> PointCloud {
-        crate::reproject::point_cloud(self)
+        let mut cloud = PointCloud::default();
+        self.point_cloud_into(&mut cloud);
+        cloud
+    }
+
+    /// As [`Self::point_cloud`], in place of what `cloud` holds: a loop over frames that keeps its
+    /// cloud takes no new memory.
+    pub fn point_cloud_into(&self, cloud: &mut PointCloud) {
+        crate::reproject::point_cloud(self, cloud);
     }
 }
 

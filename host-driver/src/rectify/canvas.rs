@@ -45,20 +45,20 @@ fn grid_px(camera: &CameraIntrinsics) -> Vec<Vector2<f64>> {
 /// One camera of the pair, with its rotation into the rectified frame.
 struct View<'a> {
     camera: &'a CameraIntrinsics,
-    rect_from_camera: Rotation3<f64>,
+    rect_camera_taps: Rotation3<f64>,
 }
 
 impl View<'_> {
     /// Rectified normalised coordinates of a raw pixel.
     fn rectified(&self, pixel: Vector2<f64>) -> Option<Vector2<f64>> {
         let ray = self.camera.normalised_of_pixel(pixel)?;
-        let ray = self.rect_from_camera * Vector3::new(ray.x, ray.y, 1.0);
+        let ray = self.rect_camera_taps * Vector3::new(ray.x, ray.y, 1.0);
         (ray.z > 0.05).then(|| ray.xy() / ray.z)
     }
 
     /// Whether this camera sees a point of the rectified frame whose origin is this camera.
     fn sees(&self, point_rect: Point3<f64>) -> bool {
-        let point = self.rect_from_camera.inverse_transform_point(&point_rect);
+        let point = self.rect_camera_taps.inverse_transform_point(&point_rect);
         let [w, h] = self.camera.resolution_px.map(|size| size as f64);
         // The distortion folds back far outside the image: only what undistorts to the same ray is
         // really seen there.
@@ -143,9 +143,9 @@ pub(super) fn choose(
 ) -> Result<RectifiedGeometry, RectifyError> {
     let rect_from_left = rect_from_left(calibration)?;
     let left_from_right = calibration.right_from_left.rotation.inverse().to_rotation_matrix();
-    let left = View { camera: &calibration.left, rect_from_camera: rect_from_left };
+    let left = View { camera: &calibration.left, rect_camera_taps: rect_from_left };
     let right =
-        View { camera: &calibration.right, rect_from_camera: rect_from_left * left_from_right };
+        View { camera: &calibration.right, rect_camera_taps: rect_from_left * left_from_right };
     let baseline_m = calibration.baseline_m();
     let focal_px = focal_px([&left, &right])?;
     let in_left = shared_bounds(&left, &right, baseline_m, depth);

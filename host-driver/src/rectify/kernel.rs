@@ -74,7 +74,7 @@ impl TapTables {
     /// Taps that bring a camera's values to samples, whose full scale is 255 * 64 whatever the
     /// camera's bits, and by how many bits their products are then shifted. Values of 16 bits must
     /// be halved, to fit 16 bits with a sign.
-    pub fn from_camera(&self, bits: u32) -> (&[[i16; TAPS]], u32) {
+    pub fn camera_taps(&self, bits: u32) -> (&[[i16; TAPS]], u32) {
         if bits == 8 {
             return (&self.plain, TAP_BITS - 6);
         }

@@ -117,13 +117,13 @@ impl Rectifier {
         let disparity = geometry
             .disparity_range(wide.min_m, wide.max_m)
             .ok_or(RectifyError::DepthRange { min_m, max_m })?;
-        let view = |camera: &crate::CameraIntrinsics, rect_from_camera, cx_px| Virtual {
+        let view = |camera: &crate::CameraIntrinsics, rect_camera_taps, cx_px| Virtual {
             radius_max: camera
                 .border_px()
                 .filter_map(|pixel| camera.normalised_of_pixel(pixel))
                 .fold(0.0, |radius, p| p.norm().max(radius)),
             camera: camera.clone(),
-            rect_from_camera,
+            rect_camera_taps,
             focal_px: geometry.focal_px,
             cx_px,
             cy_px: geometry.cy_px,

@@ -49,7 +49,7 @@ pub struct RectifyScratch {
 /// A virtual camera: where canvas pixels are on the real one.
 pub(super) struct Virtual {
     pub camera: CameraIntrinsics,
-    pub rect_from_camera: Rotation3<f64>,
+    pub rect_camera_taps: Rotation3<f64>,
     pub focal_px: f64,
     pub cx_px: f64,
     pub cy_px: f64,
@@ -63,7 +63,7 @@ impl Virtual {
     pub fn raw_px(&self, u: f64, v: f64) -> Vector2<f64> {
         let ray_rect =
             Vector3::new((u - self.cx_px) / self.focal_px, (v - self.cy_px) / self.focal_px, 1.0);
-        let ray = self.rect_from_camera.inverse_transform_vector(&ray_rect);
+        let ray = self.rect_camera_taps.inverse_transform_vector(&ray_rect);
         if ray.z <= 0.01 {
             return Vector2::repeat(f64::MAX);
         }
@@ -110,7 +110,8 @@ impl Warp {
                 }
                 x_of_rows(&path, raw_w, x_of_row);
             });
-        let mask = Image::from_vec(w, h, transposed(&seen, h)).unwrap_or_else(|| Image::new(w, h, 0));
+        let mask =
+            Image::from_vec(w, h, transposed(&seen, h)).unwrap_or_else(|| Image::new(w, h, 0));
         Self {
             level: level.usable(),
             along_rows: Places::new(&transposed(&along_rows, raw_h), w),
@@ -131,7 +132,7 @@ impl Warp {
         scratch.between.resize(stride * (raw_h + TAPS), 0);
         scratch.lines.resize(line_len * raw_h.div_ceil(BAND), 0);
         let bits = u32::from(raw.bits.clamp(1, 16));
-        let (taps, shift) = self.taps.from_camera(bits);
+        let (taps, shift) = self.taps.camera_taps(bits);
         let lines = Lines { raw, width: raw_w, halve: bits == 16 };
         let inner = &mut scratch.between[TAPS_BEFORE * stride..][..raw_h * stride];
         inner

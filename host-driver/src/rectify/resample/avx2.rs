@@ -65,7 +65,8 @@ pub(super) unsafe fn along(
             *sum = _mm256_sra_epi32(_mm256_add_epi32(all, rounding), by);
         }
         // Packing leaves outputs 0-3, 8-11, 4-7, 12-15.
-        let packed = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi32(sums[0], sums[1]));
+        let packed =
+            _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi32(sums[0], sums[1]));
         // SAFETY: 32 bytes.
         unsafe { _mm256_storeu_si256(out.as_mut_ptr().cast(), packed) };
     }
@@ -120,8 +121,10 @@ pub(super) unsafe fn across(
                 };
             }
             // From eight taps an output to pairs of taps of all outputs.
-            let (a, b) = (_mm256_unpacklo_epi32(own[0], own[1]), _mm256_unpacklo_epi32(own[2], own[3]));
-            let (c, d) = (_mm256_unpackhi_epi32(own[0], own[1]), _mm256_unpackhi_epi32(own[2], own[3]));
+            let (a, b) =
+                (_mm256_unpacklo_epi32(own[0], own[1]), _mm256_unpacklo_epi32(own[2], own[3]));
+            let (c, d) =
+                (_mm256_unpackhi_epi32(own[0], own[1]), _mm256_unpackhi_epi32(own[2], own[3]));
             let pairs = [
                 _mm256_unpacklo_epi64(a, b),
                 _mm256_unpackhi_epi64(a, b),

@@ -14,13 +14,7 @@ fn place(row: Row<'_>, k: usize) -> (usize, usize) {
     (row.blocks[k / BLOCK].first as usize + (offset >> PHASE_BITS), offset % PHASES)
 }
 
-pub(super) fn along(
-    line: &[i16],
-    row: Row<'_>,
-    taps: &[[i16; TAPS]],
-    shift: u32,
-    out: &mut [i16],
-) {
+pub(super) fn along(line: &[i16], row: Row<'_>, taps: &[[i16; TAPS]], shift: u32, out: &mut [i16]) {
     for (k, out) in out.iter_mut().enumerate() {
         let (first, phase) = place(row, k);
         let pairs = line[first..].iter().zip(&taps[phase]);

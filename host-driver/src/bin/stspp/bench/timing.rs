@@ -7,7 +7,7 @@ use stspp::cpu_time::{Step, Stopwatch};
 use stspp::reconstruct::{ReconstructError, RectifiedStack};
 use stspp::recording::StereoPair;
 use stspp::rectify::{Rectifier, RectifyScratch};
-use stspp::{Recording, StereoCalibration, report, reproject};
+use stspp::{PointCloud, Recording, StereoCalibration, report, reproject};
 use stspp_matcher::{Matcher, Params};
 
 use crate::exit::{Failure, Kind};
@@ -80,7 +80,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     };
     let progress = output.progress(args.repeat.max(1) as u64, "matching");
     let mut best: Option<(Vec<Step>, usize)> = None;
-    let mut scratch = RectifyScratch::default();
+    let (mut scratch, mut cloud) = (RectifyScratch::default(), PointCloud::default());
     let (mut left, mut right) = (stack.rectifier.canvas(), stack.rectifier.canvas());
     for _ in 0..args.repeat.max(1) {
         let mut watch = Stopwatch::default();
@@ -103,7 +103,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         let frame =
             reproject::depth_frame(stack.rectifier.geometry(), matched, intensity, Vec::new());
         watch.step("reproject");
-        let points = frame.point_cloud().len();
+        frame.point_cloud_into(&mut cloud);
+        let points = cloud.len();
         watch.step("point cloud");
         let steps: Vec<Step> = watch.steps().to_vec();
         let total = |steps: &[Step]| -> f64 {
