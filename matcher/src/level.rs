@@ -17,7 +17,8 @@ pub enum Level {
     Neon,
     /// x86-64 AVX2 with FMA, 256 bits.
     Avx2,
-    /// x86-64 AVX-512 F, BW, VL, DQ with VPOPCNTDQ, BITALG and VNNI (Ice Lake, Zen 4 and later), 512 bits.
+    /// x86-64 AVX-512 F, BW, VL, DQ with VPOPCNTDQ, BITALG, VNNI, VBMI and GFNI (Ice Lake, Zen 4
+    /// and later), 512 bits.
     Avx512,
 }
 
@@ -93,6 +94,8 @@ impl Level {
                     && is_x86_feature_detected!("avx512vpopcntdq")
                     && is_x86_feature_detected!("avx512bitalg")
                     && is_x86_feature_detected!("avx512vnni")
+                    && is_x86_feature_detected!("avx512vbmi")
+                    && is_x86_feature_detected!("gfni")
             }
             #[allow(unreachable_patterns)]
             _ => false,

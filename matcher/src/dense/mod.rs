@@ -20,6 +20,7 @@ pub(crate) mod normalise;
 pub mod order;
 pub(crate) mod refit;
 pub(crate) mod solve;
+mod steps;
 pub(crate) mod tile;
 pub(crate) mod warp;
 
@@ -27,11 +28,10 @@ use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use crate::{
-    Image, Level, Sample, ShapeFunction, StereoStack, lanes::vectorised, params::RADIUS_LIMIT,
-};
+use crate::{Image, Level, Sample, ShapeFunction, StereoStack};
 use motion::{BLOCK, Motion};
 use solve::Fits;
+pub use steps::mark_steps;
 use tile::{Job, Output, Tile};
 
 /// Columns a tile fits: its rows stay in a core's second-level cache.
@@ -199,107 +199,4 @@ fn origin(start: &Image<f32>) -> f32 {
         n += 1;
     }
     if n == 0 { 0.0 } else { (sum / f64::from(n)).round() as f32 }
-}
-
-/// Marks the pixels whose window of `radius` holds a depth step: a disparity more than `limit` px from
-/// their own, and a jump of that size between neighbours, or a gap. A steep surface has no jump.
-pub fn mark_steps(
-    level: Level,
-    start: &Image<f32>,
-    radius: usize,
-    limit: f32,
-    out: &mut Image<u8>,
-) {
-    let (width, height) = (start.width(), start.height());
-    let level = level.usable();
-    let radius = radius.min(RADIUS_LIMIT);
-    if (out.width(), out.height()) != (width, height) {
-        *out = Image::new(width, height, 0);
-    }
-    let data = out.as_mut_slice();
-    data.par_chunks_mut((width * 32).max(1)).enumerate().for_each_init(
-        || {
-            let row = |v: f32| vec![v; width + 2 * radius];
-            [row(f32::INFINITY), row(f32::NEG_INFINITY), row(0.0), row(0.0)]
-        },
-        |[low, high, jumps, wide], (band, marks)| {
-            for (i, marks) in marks.chunks_mut(width).enumerate() {
-                let y = band * 32 + i;
-                let (top, end) = (y.saturating_sub(radius), (y + radius + 1).min(height));
-                let mut rows = [start.row(y); 2 * RADIUS_LIMIT + 1];
-                for (to, row) in rows.iter_mut().zip(top..end) {
-                    *to = start.row(row);
-                }
-                vectorised!(
-                    level,
-                    mark_row(
-                        rows: &[&[f32]] = &rows[..end - top],
-                        own: &[f32] = start.row(y),
-                        limit: f32 = limit,
-                        low: &mut [f32] = low,
-                        high: &mut [f32] = high,
-                        jumps: &mut [f32] = jumps,
-                        wide: &mut [f32] = wide,
-                        marks: &mut [u8] = marks,
-                    )
-                );
-            }
-        },
-    );
-}
-
-/// `low` and `high` hold the column extremes, with neutral values beyond the image's sides.
-#[inline(always)]
-#[allow(clippy::too_many_arguments)]
-fn mark_row(
-    rows: &[&[f32]],
-    own: &[f32],
-    limit: f32,
-    low: &mut [f32],
-    high: &mut [f32],
-    jumps: &mut [f32],
-    wide: &mut [f32],
-    marks: &mut [u8],
-) {
-    let width = own.len();
-    let radius = (low.len() - width) / 2;
-    let (column_low, column_high) = (&mut low[radius..][..width], &mut high[radius..][..width]);
-    column_low.fill(f32::INFINITY);
-    column_high.fill(f32::NEG_INFINITY);
-    for row in rows {
-        for ((lo, hi), &v) in column_low.iter_mut().zip(column_high.iter_mut()).zip(*row) {
-            // NaN loses either comparison.
-            *lo = if v < *lo { v } else { *lo };
-            *hi = if v > *hi { v } else { *hi };
-        }
-    }
-    // One where a neighbour in the row or below is far or missing.
-    let column = &mut jumps[radius..][..width];
-    column.fill(0.0);
-    for (i, row) in rows.iter().enumerate() {
-        let below = rows[(i + 1).min(rows.len() - 1)];
-        for (((jump, &v), &right), &below) in
-            column.iter_mut().zip(*row).zip(row.iter().skip(1)).zip(below)
-        {
-            let near = (right - v).abs() <= limit && (below - v).abs() <= limit;
-            *jump = if near { *jump } else { 1.0 };
-        }
-    }
-    let jump = &mut wide[..width];
-    jump.fill(0.0);
-    for j in 0..2 * radius + 1 {
-        for (to, &v) in jump.iter_mut().zip(&jumps[j..j + width]) {
-            *to = if v > *to { v } else { *to };
-        }
-    }
-    marks.fill(0);
-    for j in 0..2 * radius + 1 {
-        let window = low[j..j + width].iter().zip(&high[j..j + width]);
-        for ((mark, &own), (&lo, &hi)) in marks.iter_mut().zip(own).zip(window) {
-            *mark |= u8::from(own - lo > limit) | u8::from(hi - own > limit);
-        }
-    }
-    for (mark, &jump) in marks.iter_mut().zip(jump.iter()) {
-        *mark &= u8::from(jump > 0.5);
-    }
 }

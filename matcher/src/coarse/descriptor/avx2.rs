@@ -5,18 +5,21 @@ use std::arch::x86_64::*;
 use super::{BLOCK, Rows};
 
 /// # Safety
-/// The processor has AVX2; there are 64 rows; `at + 32` lies within every row and `out`.
+/// The processor has AVX2; there are 64 rows; `at + 32` lies within every row and `out`, and
+/// `at + 32 - begin` within `mean`.
 #[target_feature(enable = "avx2")]
 pub(super) unsafe fn blocks(
     rows: &Rows<'_>,
     mean: &[i16],
+    begin: usize,
     at: impl Iterator<Item = usize>,
     out: &mut [u64],
 ) {
     for from in at.flat_map(|at| [at, at + BLOCK / 2]) {
         // SAFETY: the caller's promise, here and below.
         let load = |row: &[i16]| unsafe { _mm256_loadu_si256(row.as_ptr().add(from).cast()) };
-        let mean = load(mean);
+        // SAFETY: as above; the means begin at column `begin`.
+        let mean = unsafe { _mm256_loadu_si256(mean.as_ptr().add(from - begin).cast()) };
         let mut words = [_mm256_setzero_si256(); 4];
         for (word, rows) in words.iter_mut().zip(rows.chunks_exact(16)) {
             for (row, other) in rows.iter().rev() {

@@ -8,6 +8,8 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use crate::{Image, Level, Sample, lanes::vectorised};
@@ -31,9 +33,19 @@ enum Test {
     Time { frame: usize, other: usize },
 }
 
+impl Test {
+    /// How many columns away it looks.
+    fn reach(&self) -> usize {
+        match self {
+            Test::Mean { dx, .. } => dx.unsigned_abs(),
+            Test::Time { .. } => 0,
+        }
+    }
+}
+
 /// The 64 tests for a number of frames: the centre in every frame, its neighbours two pixels away,
 /// the centre between frames, then samples ever farther away.
-fn tests(frames: usize) -> Vec<Test> {
+fn tests(frames: usize) -> [Test; 64] {
     let mut tests = Vec::with_capacity(64 + 16);
     let at = |dx, dy| (0..frames).map(move |frame| Test::Mean { dx, dy, frame });
     tests.extend(at(0, 0));
@@ -54,30 +66,20 @@ fn tests(frames: usize) -> Vec<Test> {
     for (dx, dy) in far {
         tests.extend(at(dx, dy));
     }
-    tests.truncate(64);
-    tests
+    std::array::from_fn(|k| tests[k])
 }
 
 /// Rows of a task.
 const BAND: usize = 32;
-
-/// A task's buffers.
-struct Scratch {
-    /// Sums over time of samples / 8.
-    light: Vec<i16>,
-    mean: Vec<i16>,
-    column: Vec<i32>,
-}
-
-impl Scratch {
-    fn new(width: usize, radius: usize) -> Self {
-        Self {
-            light: vec![0; width * (BAND + 2 * radius)],
-            mean: vec![0; width + BLOCK],
-            column: vec![0; width],
-        }
-    }
-}
+/// Blocks of a strip: ten frames' rows of it, as many as windows reach, stay in the first-level cache.
+const STRIP: usize = 8;
+/// Farthest that a window or a test reaches to either side.
+const REACH: usize = 4;
+/// Most rows of a window.
+const ROWS: usize = 2 * REACH + 1;
+/// Most columns of a strip: whole blocks, the edges that no block covers, one block that overlaps
+/// the strip before, and what windows reach; rounded up to whole vectors.
+const COLUMNS: usize = (STRIP + 1) * BLOCK + 4 * REACH + BLOCK;
 
 /// Descriptors of one image stack.
 #[derive(Debug, Default)]
@@ -100,159 +102,322 @@ impl Descriptors {
 
     /// Describes a stack.
     pub(crate) fn describe(&mut self, level: Level, images: &[&Image<Sample>]) {
-        let (width, height) = (images[0].width(), images[0].height());
+        let width = images[0].width();
         self.width = width;
         self.stride = width.next_multiple_of(BLOCK) + 2 * MARGIN;
-        self.data.resize(self.stride * height, OUTSIDE);
+        self.data.resize(self.stride * images[0].height(), OUTSIDE);
         let tests = tests(images.len());
-        // A window's mean over few frames needs more of its area.
-        let radius = if images.len() < 4 { 4 } else { 2 };
         let stride = self.stride;
-        self.data.par_chunks_mut(stride * BAND).enumerate().for_each_init(
-            || Scratch::new(width, radius),
-            |scratch, (band, rows)| {
-                let Scratch { light, mean, column } = scratch;
-                // Sums over time of the band's rows and those its windows reach; rows beyond the
-                // image repeat the outermost one.
-                for (i, light) in light.chunks_mut(width).enumerate() {
-                    let y = (band * BAND + i).saturating_sub(radius).min(height - 1);
-                    light.fill(0);
-                    for image in images {
-                        add_eighth(level, image.row(y), light);
-                    }
-                }
-                let side = 2 * radius + 1;
-                let scale = 8.0 / (side * side * images.len()) as f32;
-                for (i, row) in rows.chunks_mut(stride).enumerate() {
-                    let mut window: [&[i16]; 9] = [&[]; 9];
-                    for (j, to) in window.iter_mut().enumerate().take(side) {
-                        *to = &light[(i + j) * width..][..width];
-                    }
-                    vectorised!(
-                        level,
-                        means_loop(
-                            rows: &[&[i16]] = &window[..side],
-                            scale: f32 = scale,
-                            column: &mut [i32] = column,
-                            mean: &mut [i16] = mean,
-                        )
-                    );
-                    row[..MARGIN].fill(OUTSIDE);
-                    row[MARGIN + width..].fill(OUTSIDE);
-                    describe_row(level, images, &tests, band * BAND + i, mean, &mut row[MARGIN..]);
-                }
-            },
-        );
+        self.data.par_chunks_mut(stride * BAND).enumerate().for_each(|(band, rows)| {
+            for row in rows.chunks_mut(stride) {
+                row[..MARGIN].fill(OUTSIDE);
+                row[MARGIN + width..].fill(OUTSIDE);
+            }
+            describe_band(level, images, &tests, band * BAND, stride, rows);
+        });
     }
 }
 
-fn add_eighth(level: Level, row: &[Sample], light: &mut [i16]) {
-    vectorised!(level, add_eighth_loop(row: &[Sample] = row, light: &mut [i16] = light));
-}
-
-#[inline(always)]
-fn add_eighth_loop(row: &[Sample], light: &mut [i16]) {
-    for (l, &v) in light.iter_mut().zip(row) {
-        *l = l.wrapping_add(v >> 3);
-    }
-}
-
-/// Means over the windows of one row from sums over time, in sample units; windows end at the image's
-/// sides by repeating the outermost pixel.
-#[inline(always)]
-fn means_loop(rows: &[&[i16]], scale: f32, column: &mut [i32], mean: &mut [i16]) {
-    let width = column.len();
-    let radius = rows.len() / 2;
-    column.fill(0);
-    for row in rows {
-        for (c, &v) in column.iter_mut().zip(*row) {
-            *c += i32::from(v);
-        }
-    }
-    let inner = radius..width.saturating_sub(radius);
-    let clamped = |x: usize, j: usize| (x + j).saturating_sub(radius).min(width - 1);
-    for x in (0..width).filter(|x| !inner.contains(x)) {
-        let sum: i32 = (0..rows.len()).map(|j| column[clamped(x, j)]).sum();
-        mean[x] = (sum as f32 * scale) as i16;
-    }
-    if inner.is_empty() {
-        return;
-    }
-    let count = inner.len();
-    let mean = &mut mean[inner];
-    if radius == 2 {
-        let (a, b, c) = (&column[..count], &column[1..1 + count], &column[2..2 + count]);
-        let (d, e) = (&column[3..3 + count], &column[4..4 + count]);
-        for x in 0..count {
-            mean[x] = ((a[x] + b[x] + c[x] + d[x] + e[x]) as f32 * scale) as i16;
-        }
-    } else {
-        for x in 0..count {
-            let sum: i32 = column[x..x + 2 * radius + 1].iter().sum();
-            mean[x] = (sum as f32 * scale) as i16;
-        }
-    }
-}
-
-fn describe_row(
+/// Describes the rows from `y0`, of which `out` has as many as fit: strip by strip of columns, so
+/// that samples come from memory once.
+fn describe_band(
     level: Level,
     images: &[&Image<Sample>],
-    tests: &[Test],
-    y: usize,
-    mean: &[i16],
+    tests: &[Test; 64],
+    y0: usize,
+    stride: usize,
     out: &mut [u64],
 ) {
     let (width, height) = (images[0].width(), images[0].height());
-    let clamp = |v: usize, d: isize, n: usize| v.saturating_add_signed(d).min(n - 1);
-    let reach = tests
-        .iter()
-        .map(|t| match t {
-            Test::Mean { dx, .. } => dx.unsigned_abs(),
-            Test::Time { .. } => 0,
-        })
-        .max()
-        .unwrap_or(0);
+    let reach = tests.iter().map(Test::reach).max().unwrap_or(0);
+    // The columns where no test leaves the image, in whole blocks; the last one may overlap the one
+    // before.
     let inner = if width >= 2 * reach + BLOCK { width - 2 * reach } else { 0 };
-    let blocks = inner / BLOCK;
-    // Whole blocks; the last one may overlap the one before.
-    let at_block = |b: usize| if b < blocks { b * BLOCK } else { inner - BLOCK };
-    let count = if inner == 0 { 0 } else { inner.div_ceil(BLOCK) };
-    if count > 0 {
-        // All slices begin at column `reach`, shifted by the test's dx.
-        let rows: Rows<'_> = std::array::from_fn(|k| match tests[k] {
-            Test::Mean { dx, dy, frame } => {
-                let row = images[frame].row(clamp(y, dy, height));
-                (&row[reach.wrapping_add_signed(dx)..][..inner], None)
+    let count = inner.div_ceil(BLOCK);
+    let at_block = |b: usize| (b * BLOCK).min(inner - BLOCK);
+    let band = out.len() / stride;
+    let tables: [Rows<'_>; BAND] = std::array::from_fn(|i| {
+        rows_of(images, tests, (y0 + i.min(band - 1)).min(height - 1), reach, inner)
+    });
+    let edges: [usize; 2] = if count == 0 { [width, width] } else { [reach, width - reach] };
+    let strips = count.div_ceil(STRIP).max(width.div_ceil(BLOCK * STRIP) * usize::from(count == 0));
+    for strip in 0..strips {
+        let blocks =
+            if count == 0 { 0..0 } else { strip * STRIP..((strip + 1) * STRIP).min(count) };
+        let columns = if count == 0 {
+            // Too narrow for blocks.
+            strip * STRIP * BLOCK..((strip + 1) * STRIP * BLOCK).min(width)
+        } else {
+            let from = if strip == 0 { 0 } else { reach + at_block(blocks.start) };
+            let to = if strip + 1 == strips { width } else { reach + blocks.end * BLOCK };
+            from..to
+        };
+        let mut means = Means::new(level, images, columns.clone());
+        means.begin(y0);
+        for (i, out) in out.chunks_mut(stride).enumerate() {
+            let mean = means.next(y0 + i);
+            let out = &mut out[MARGIN..][..width];
+            if !blocks.is_empty() {
+                let at = blocks.clone().map(at_block);
+                let out = &mut out[reach..][..inner];
+                let (rows, mean) = (&tables[i], &mean[reach.saturating_sub(columns.start)..]);
+                let begin = columns.start.saturating_sub(reach);
+                match level {
+                    // SAFETY: trusted levels are the processor's; rows and `out` are `inner` long,
+                    // where blocks end at most, and the means are those of the strip's columns.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx512 => unsafe { avx512::blocks(rows, mean, begin, at, out) },
+                    // SAFETY: as above.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx2 => unsafe { avx2::blocks(rows, mean, begin, at, out) },
+                    _ => scalar::blocks(rows, mean, begin, at, out),
+                }
             }
-            Test::Time { frame, other } => {
-                let of = |f: usize| &images[f].row(y)[reach..][..inner];
-                (of(frame), Some(of(other)))
-            }
-        });
-        let at = (0..count).map(at_block);
-        let (mean, out) = (&mean[reach..][..inner], &mut out[reach..][..inner]);
-        match level {
-            // SAFETY: trusted levels are the processor's; all slices are `inner` long, and blocks
-            // end there at most.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { avx512::blocks(&rows, mean, at, out) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { avx2::blocks(&rows, mean, at, out) },
-            _ => scalar::blocks(&rows, mean, at, out),
+            let edge = columns.clone().filter(|x| *x < edges[0] || *x >= edges[1]);
+            describe_edge(images, tests, y0 + i, edge, (mean, columns.start), out);
         }
     }
-    let done = if count == 0 { 0..0 } else { reach..width - reach };
-    for x in (0..width).filter(|x| !done.contains(x)) {
+}
+
+/// What each test compares on row `y`: slices of `inner` samples that begin at column `reach`,
+/// shifted by the test's dx.
+fn rows_of<'a>(
+    images: &[&'a Image<Sample>],
+    tests: &[Test; 64],
+    y: usize,
+    reach: usize,
+    inner: usize,
+) -> Rows<'a> {
+    let height = images[0].height();
+    if inner == 0 {
+        return [(&[], None); 64];
+    }
+    std::array::from_fn(|k| match tests[k] {
+        Test::Mean { dx, dy, frame } => {
+            let row = images[frame].row(clamp(y, dy, height));
+            (&row[reach.wrapping_add_signed(dx)..][..inner], None)
+        }
+        Test::Time { frame, other } => {
+            let of = |f: usize| &images[f].row(y)[reach..][..inner];
+            (of(frame), Some(of(other)))
+        }
+    })
+}
+
+/// Describes the columns at which a test leaves the image: samples there repeat the outermost one.
+fn describe_edge(
+    images: &[&Image<Sample>],
+    tests: &[Test; 64],
+    y: usize,
+    columns: impl Iterator<Item = usize>,
+    (mean, from): (&[i16], usize),
+    out: &mut [u64],
+) {
+    let (width, height) = (images[0].width(), images[0].height());
+    for x in columns {
         out[x] = tests.iter().enumerate().fold(0, |bits, (k, test)| {
             let (value, than) = match *test {
                 Test::Mean { dx, dy, frame } => {
-                    (images[frame].row(clamp(y, dy, height))[clamp(x, dx, width)], mean[x])
+                    let row = images[frame].row(clamp(y, dy, height));
+                    (row[clamp(x, dx, width)], mean[x - from])
                 }
                 Test::Time { frame, other } => (images[frame].row(y)[x], images[other].row(y)[x]),
             };
             bits | u64::from(value > than) << k
         });
+    }
+}
+
+/// `v` + `d`, brought into 0..`n`.
+fn clamp(v: usize, d: isize, n: usize) -> usize {
+    v.saturating_add_signed(d).min(n - 1)
+}
+
+/// Means over space and time around the pixels of a strip of columns, row by row.
+///
+/// In 16 bits: the mean over time is rounded to half or whole grey levels, which the mean over space
+/// averages out.
+struct Means<'a> {
+    level: Level,
+    images: &'a [&'a Image<Sample>],
+    columns: Range<usize>,
+    scale: Scale,
+    /// Means over time of the window's rows, from [`REACH`] columns before the strip.
+    light: [[i16; COLUMNS]; ROWS],
+    /// Their sums.
+    column: [i16; COLUMNS],
+    mean: [i16; COLUMNS],
+}
+
+/// A window and the fixed-point factors of its mean.
+#[derive(Clone, Copy)]
+struct Scale {
+    radius: usize,
+    /// Sum of eighths of samples, to their mean: (sum + `round`) * `time` / 2^16.
+    time: i16,
+    round: i16,
+    /// Sum of means, to the mean in samples: (sum << `up`) * `space` / 2^16 << `back`.
+    space: i16,
+    up: u32,
+    back: u32,
+}
+
+impl Scale {
+    /// A window's mean over few frames needs more of its area.
+    fn new(frames: usize) -> Self {
+        let n = frames as i16;
+        if frames < 4 {
+            // Units of 64 samples; 81 pixels: 2^16 * 64 / 4 / 81.
+            Self { radius: 4, time: 8192 / n, round: 4 * n, space: 12_945, up: 0, back: 2 }
+        } else {
+            // Units of 32 samples; 25 pixels: 2^16 * 32 / 4 / 25.
+            Self { radius: 2, time: 16_384 / n, round: 2 * n, space: 20_972, up: 1, back: 1 }
+        }
+    }
+}
+
+impl<'a> Means<'a> {
+    fn new(level: Level, images: &'a [&'a Image<Sample>], columns: Range<usize>) -> Self {
+        Self {
+            level,
+            images,
+            columns,
+            scale: Scale::new(images.len()),
+            light: [[0; COLUMNS]; ROWS],
+            column: [0; COLUMNS],
+            mean: [0; COLUMNS],
+        }
+    }
+
+    /// Sums up the rows before row `y`'s last one.
+    fn begin(&mut self, y: usize) {
+        for row in 0..2 * self.scale.radius {
+            self.enter(y + row);
+        }
+    }
+
+    /// The means of row `y`, which must follow the row of the last call.
+    fn next(&mut self, y: usize) -> &[i16] {
+        let radius = self.scale.radius;
+        self.enter(y + 2 * radius);
+        let len = self.columns.len();
+        vectorised!(
+            self.level,
+            means_loop(
+                column: &[i16] = &self.column[REACH - radius..][..len + 2 * radius],
+                scale: Scale = self.scale,
+                mean: &mut [i16] = &mut self.mean[..len],
+            )
+        );
+        &self.mean[..len]
+    }
+
+    /// Takes image row `row` - radius (the nearest where there is none) into the sums, and the one a
+    /// window before out.
+    fn enter(&mut self, row: usize) {
+        let (width, height) = (self.images[0].width(), self.images[0].height());
+        let radius = self.scale.radius;
+        let y = row.saturating_sub(radius).min(height - 1);
+        let from = self.columns.start.saturating_sub(REACH);
+        let to = (self.columns.end + REACH).min(width);
+        prefetch(self.images, row + 1, from..to);
+        let mut rows: [&[Sample]; 16] = [&[]; 16];
+        for (to_row, image) in rows.iter_mut().zip(self.images) {
+            *to_row = &image.row(y)[from..to];
+        }
+        // Columns beyond the image repeat the outermost one.
+        let before = REACH - (self.columns.start - from);
+        let len = self.columns.len() + 2 * REACH;
+        vectorised!(
+            self.level,
+            enter_loop(
+                rows: &[&[Sample]] = &rows[..self.images.len()],
+                scale: Scale = self.scale,
+                before: usize = before,
+                light: &mut [i16] = &mut self.light[row % (2 * radius + 1)][..len],
+                column: &mut [i16] = &mut self.column[..len],
+            )
+        );
+    }
+}
+
+/// Asks for the samples of a row that will be needed soon.
+fn prefetch(images: &[&Image<Sample>], y: usize, columns: Range<usize>) {
+    #[cfg(target_arch = "x86_64")]
+    if y < images[0].height() {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        for image in images {
+            for line in image.row(y)[columns.clone()].chunks(32) {
+                // SAFETY: a hint about memory that the slice holds.
+                unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
+            }
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (images, y, columns);
+}
+
+/// Replaces a row of means over time by that of `rows`, which has `before` columns fewer on the left,
+/// and brings the column sums up to date.
+#[inline(always)]
+fn enter_loop(
+    rows: &[&[Sample]],
+    scale: Scale,
+    before: usize,
+    light: &mut [i16],
+    column: &mut [i16],
+) {
+    let mut new = [0i16; COLUMNS];
+    let count = rows[0].len();
+    let inner = &mut new[before..before + count];
+    let (blocks, rest) = inner.as_chunks_mut::<BLOCK>();
+    let done = blocks.len() * BLOCK;
+    let mean =
+        |sum: i16| (i32::from(sum.wrapping_add(scale.round)) * i32::from(scale.time) >> 16) as i16;
+    for (b, light) in blocks.iter_mut().enumerate() {
+        let mut sum = [0i16; BLOCK];
+        for row in rows {
+            if let Some(row) = row[b * BLOCK..].first_chunk::<BLOCK>() {
+                for (s, v) in sum.iter_mut().zip(row) {
+                    *s = s.wrapping_add(v >> 3);
+                }
+            }
+        }
+        *light = sum.map(mean);
+    }
+    for (i, light) in rest.iter_mut().enumerate() {
+        let sum = rows.iter().fold(0, |sum: i16, row| sum.wrapping_add(row[done + i] >> 3));
+        *light = mean(sum);
+    }
+    let (first, last) = (new[before], new[before + count - 1]);
+    new[..before].fill(first);
+    new[before + count..light.len()].fill(last);
+    for ((sum, old), new) in column.iter_mut().zip(light).zip(new) {
+        *sum = sum.wrapping_add(new.wrapping_sub(*old));
+        *old = new;
+    }
+}
+
+/// Means in sample units from sums over columns, which begin `radius` before the first pixel.
+#[inline(always)]
+fn means_loop(column: &[i16], scale: Scale, mean: &mut [i16]) {
+    let count = mean.len();
+    let finish = |sum: i16| {
+        let scaled = i32::from(sum << scale.up) * i32::from(scale.space) >> 16;
+        (scaled as i16) << scale.back
+    };
+    if scale.radius == 2 {
+        let (a, b, c) = (&column[..count], &column[1..1 + count], &column[2..2 + count]);
+        let (d, e) = (&column[3..3 + count], &column[4..4 + count]);
+        for x in 0..count {
+            let near = b[x].wrapping_add(c[x]).wrapping_add(d[x]);
+            mean[x] = finish(near.wrapping_add(a[x]).wrapping_add(e[x]));
+        }
+    } else {
+        for x in 0..count {
+            let window = &column[x..x + 2 * REACH + 1];
+            mean[x] = finish(window.iter().fold(0, |sum: i16, v| sum.wrapping_add(*v)));
+        }
     }
 }
 
