@@ -4,6 +4,7 @@
 //! all, parabola, reliability retry, left-right check, sub-pixel refinement by Stereo-DIC, growth into
 //! the gaps, the verdict on pixels at depth steps, and comes out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
 
+mod aligned;
 pub mod bspline;
 pub mod census;
 pub mod check;

@@ -238,7 +238,7 @@ impl Scene {
             }
         }
         let mut random = Random::new(self.seed.wrapping_mul(77) ^ (frame as u64) << 8 ^ side << 4);
-        let data = light
+        let data: Vec<Sample> = light
             .into_iter()
             .map(|dn| {
                 let dn = dn * gain + offset_dn;
@@ -252,7 +252,10 @@ impl Scene {
                 (dn.clamp(0.0, 255.0) * f64::from(SAMPLES_PER_DN8)).round() as Sample
             })
             .collect();
-        Image::from_vec(w, h, data).expect("as many samples as pixels")
+        // Placed in memory as a rectifier's canvases are.
+        let mut image = Image::new(w, h, 0);
+        image.as_mut_slice().copy_from_slice(&data);
+        image
     }
 }
 

@@ -18,7 +18,7 @@ use super::{
     solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
     warp::{Source, Warped, moving, warp_row},
 };
-use crate::{Image, Level, Sample};
+use crate::{Image, Level, Sample, aligned::Aligned};
 
 /// What all tiles of a frame share.
 pub(crate) struct Job<'a> {
@@ -53,7 +53,7 @@ pub(crate) struct Output<'a> {
 /// Padded rows by image row, the last `depth` of them kept.
 #[derive(Debug, Default)]
 struct Ring {
-    data: Vec<f32>,
+    data: Aligned<f32>,
     stride: usize,
     depth: usize,
 }
@@ -61,7 +61,6 @@ struct Ring {
 impl Ring {
     fn resize(&mut self, stride: usize, depth: usize) {
         if (self.stride, self.depth) != (stride, depth) {
-            self.data.clear();
             self.data.resize(stride * depth, 0.0);
             (self.stride, self.depth) = (stride, depth);
         }
@@ -116,11 +115,11 @@ fn around_all<const K: usize, T>(
 pub(crate) struct Tile {
     len: usize,
     words: usize,
-    gradient: Vec<i32>,
-    grey: Vec<i32>,
+    gradient: Aligned<i32>,
+    grey: Aligned<i32>,
     /// Column sums of the eight maps that windows sum, sliding down.
-    columns: [Vec<f32>; 8],
-    flagged: Vec<f32>,
+    columns: [Aligned<f32>; 8],
+    flagged: Aligned<f32>,
     powers: Powers,
     w0: Ring,
     /// Static sums.
@@ -175,14 +174,16 @@ impl Pass {
         }
     }
 
-    fn warped(&mut self, y: isize) -> Warped<'_> {
+    /// Where the warp of row `y` goes; the products of grey values are for the similarity, which
+    /// the first pass does not give.
+    fn warped(&mut self, y: isize, with_lg: bool) -> Warped<'_> {
         Warped {
             at: self.at.inner_mut(y),
             valid: self.valid.inner_mut(y),
             ig: self.ig.inner_mut(y),
             g: self.g.inner_mut(y),
             gg: self.gg.inner_mut(y),
-            lg: self.lg.inner_mut(y),
+            lg: with_lg.then(|| self.lg.inner_mut(y)),
         }
     }
 
@@ -203,8 +204,8 @@ impl Tile {
         self.gradient.resize(self.words * window, 0);
         self.grey.resize(self.words * window, 0);
         for column in &mut self.columns {
-            column.clear();
             column.resize(stride, 0.0);
+            column.fill(0.0);
         }
         self.flagged.resize(len, 0.0);
         self.powers = powers(radius);
@@ -337,7 +338,7 @@ impl Tile {
         };
         let motion =
             job.motion.and_then(|m| m.of_row(y as usize, (x0, x1), self.len, &mut self.rate));
-        warp(job.level, &source, motion, &mut self.moving, &mut self.first.warped(y));
+        warp(job.level, &source, motion, &mut self.moving, &mut self.first.warped(y, false));
         let valid = self.first.valid.row(y);
         product_row(job.level, self.l.row(y), valid, self.len, self.l_used.row_mut(y));
         product_row(job.level, self.ll.row(y), valid, self.len, self.ll_used.row_mut(y));
@@ -439,7 +440,7 @@ impl Tile {
             let columns = (x0, (x0 + len).min(job.start.width()));
             let motion =
                 job.motion.and_then(|m| m.of_row(y as usize, columns, len, &mut self.rate));
-            warp(level, &source, motion, &mut self.moving, &mut self.second.warped(y));
+            warp(level, &source, motion, &mut self.moving, &mut self.second.warped(y, true));
         }
     }
 
@@ -493,15 +494,14 @@ impl Tile {
             return;
         }
         let step = &job.step.row(y as usize)[x0..];
-        let mut any = false;
-        for (flag, &step) in self.flagged.iter_mut().zip(step) {
-            *flag = f32::from(step);
-            any |= step != 0;
-        }
-        if !any {
+        let step = &step[..step.len().min(len)];
+        if step.iter().fold(0, |any, s| any | s) == 0 {
             return;
         }
-        self.flagged[step.len().min(len)..].fill(0.0);
+        for (flag, &step) in self.flagged.iter_mut().zip(step) {
+            *flag = f32::from(step);
+        }
+        self.flagged[step.len()..].fill(0.0);
         around(&self.s_used, y, r, |s| {
             around(&pass.q, y, r, |q| {
                 around(w, y, r, |w| {

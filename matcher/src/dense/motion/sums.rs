@@ -203,7 +203,7 @@ impl Scratch {
         let (gradient, grey) = (&self.weighted[..], &self.gradient[..]);
         let source =
             Source { right: &right[..even], x0: 0, w: &self.w, gradient, grey, stride: len };
-        let mut out = Warped { at: &mut self.at, valid: n, ig: igt, g, gg, lg: ig };
+        let mut out = Warped { at: &mut self.at, valid: n, ig: igt, g, gg, lg: Some(ig) };
         let moving = motion.and_then(|m| m.of_row(y, (0, stack.width()), len, &mut self.rate));
         match moving {
             None => warp_row(frame.level, &source, &mut out),

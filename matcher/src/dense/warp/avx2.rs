@@ -15,6 +15,7 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
     let width = source.right[0].len();
     let ones = _mm256_set1_epi16(1);
     let half = _mm256_set1_epi32(0x8000);
+    let quarter = _mm256_set1_epi16(8192);
     let blocks = source.w.len() / 8;
     for block in 0..blocks {
         let i = block * 8;
@@ -29,6 +30,8 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
                 (first[l], phase[l], mask[l]) = (f, p, -1);
             }
         }
+        // Neighbours at one whole disparity, as where a coarse search starts: nothing is interpolated.
+        let together = (0..8).all(|l| mask[l] != 0 && phase[l] == 0 && first[l] == first[0] + l);
         let mut taps = [half; 4];
         for (j, taps) in taps.iter_mut().enumerate() {
             // SAFETY: a phase's taps are 16 bytes.
@@ -41,33 +44,48 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
         let zero = _mm256_setzero_si256();
         let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
         for (pair, rows) in source.right.chunks_exact(2).enumerate() {
-            let mut sums = [half; 2];
-            for (sum, row) in sums.iter_mut().zip(rows) {
-                let mut products = taps;
-                for (j, product) in products.iter_mut().enumerate() {
-                    // SAFETY: `first + 8` is at most the row's length.
-                    let samples =
-                        unsafe { two(row.as_ptr().add(first[j]), row.as_ptr().add(first[j + 4])) };
-                    *product = _mm256_madd_epi16(samples, *product);
+            let g = if together {
+                // SAFETY: eight samples from the fourth of the first pixel's taps end before the
+                // last pixel's last tap.
+                let (even, odd) = unsafe {
+                    (
+                        _mm_loadu_si128(rows[0].as_ptr().add(first[0] + 3).cast()),
+                        _mm_loadu_si128(rows[1].as_ptr().add(first[0] + 3).cast()),
+                    )
+                };
+                let samples =
+                    _mm256_set_m128i(_mm_unpackhi_epi16(even, odd), _mm_unpacklo_epi16(even, odd));
+                // Rounds as the taps of phase 0 do.
+                _mm256_mulhrs_epi16(samples, quarter)
+            } else {
+                let mut sums = [half; 2];
+                for (sum, row) in sums.iter_mut().zip(rows) {
+                    let mut products = taps;
+                    for (j, product) in products.iter_mut().enumerate() {
+                        // SAFETY: `first + 8` is at most the row's length.
+                        let samples = unsafe {
+                            two(row.as_ptr().add(first[j]), row.as_ptr().add(first[j + 4]))
+                        };
+                        *product = _mm256_madd_epi16(samples, *product);
+                    }
+                    let all = _mm256_hadd_epi32(
+                        _mm256_hadd_epi32(products[0], products[1]),
+                        _mm256_hadd_epi32(products[2], products[3]),
+                    );
+                    *sum = _mm256_add_epi32(*sum, all);
                 }
-                let all = _mm256_hadd_epi32(
-                    _mm256_hadd_epi32(products[0], products[1]),
-                    _mm256_hadd_epi32(products[2], products[3]),
-                );
-                *sum = _mm256_add_epi32(*sum, all);
-            }
-            let even = _mm256_srli_epi32::<16>(sums[0]);
-            let g = _mm256_blend_epi16::<0xAA>(even, sums[1]);
-            let word = pair * source.stride + i;
-            // SAFETY: `word + 8` lies within both.
-            let (gradient, grey) = unsafe {
-                (
-                    _mm256_loadu_si256(source.gradient.as_ptr().add(word).cast()),
-                    _mm256_loadu_si256(source.grey.as_ptr().add(word).cast()),
-                )
+                let even = _mm256_srli_epi32::<16>(sums[0]);
+                _mm256_blend_epi16::<0xAA>(even, sums[1])
             };
+            let word = pair * source.stride + i;
+            // SAFETY: `word + 8` lies within the gradients.
+            let gradient = unsafe { _mm256_loadu_si256(source.gradient.as_ptr().add(word).cast()) };
             ig = _mm256_add_epi32(ig, _mm256_madd_epi16(g, gradient));
-            lg = _mm256_add_epi32(lg, _mm256_madd_epi16(g, grey));
+            if out.lg.is_some() {
+                // SAFETY: as above, within the grey values.
+                let grey = unsafe { _mm256_loadu_si256(source.grey.as_ptr().add(word).cast()) };
+                lg = _mm256_add_epi32(lg, _mm256_madd_epi16(g, grey));
+            }
             g1 = _mm256_add_epi32(g1, _mm256_madd_epi16(g, ones));
             gg = _mm256_add_epi32(gg, _mm256_madd_epi16(g, g));
         }
@@ -81,7 +99,9 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             _mm256_storeu_ps(out.ig.as_mut_ptr().add(i), float(ig));
             _mm256_storeu_ps(out.g.as_mut_ptr().add(i), float(g1));
             _mm256_storeu_ps(out.gg.as_mut_ptr().add(i), square(gg));
-            _mm256_storeu_ps(out.lg.as_mut_ptr().add(i), square(lg));
+            if let Some(out) = &mut out.lg {
+                _mm256_storeu_ps(out.as_mut_ptr().add(i), square(lg));
+            }
         }
     }
     blocks * 8

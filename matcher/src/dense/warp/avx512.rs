@@ -58,6 +58,25 @@ unsafe fn place(source: &Source<'_>, i: usize, width: i32) -> Place {
 /// [`super::warp_row`] checks.
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512vnni")]
 pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Warped<'_>) -> usize {
+    // SAFETY: the caller's promise.
+    unsafe {
+        match out.lg {
+            None => blocks_with::<false>(kernels, source, out),
+            Some(_) => blocks_with::<true>(kernels, source, out),
+        }
+    }
+}
+
+/// [`blocks`], with or without the products of grey values.
+///
+/// # Safety
+/// As there.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512vnni")]
+unsafe fn blocks_with<const LG: bool>(
+    kernels: &Kernels,
+    source: &Source<'_>,
+    out: &mut Warped<'_>,
+) -> usize {
     let width = source.right[0].len() as i32;
     // Per pair of taps, a register of the 16 phases' coefficient pairs.
     let mut table = [[0i32; 16]; 4];
@@ -73,6 +92,7 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
     }
     let ones = _mm512_set1_epi16(1);
     let half = _mm512_set1_epi32(0x8000);
+    let quarter = _mm512_set1_epi16(8192);
     let blocks = source.w.len() / 16;
     // The windows' places first: finding one takes long, but many at a time overlap.
     let mut bases = [0i32; AHEAD];
@@ -93,6 +113,8 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             *to = _mm512_permutexvar_epi32(phase, table);
         }
         let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
+        // At whole pixels, where a coarse search starts, nothing is interpolated.
+        let whole = _mm512_mask_test_epi32_mask(valid, phase, phase) == 0;
         let mut left = valid;
         let mut base = bases[block % AHEAD];
         while left != 0 {
@@ -106,30 +128,42 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             for (j, pick) in (0i32..).zip(&mut pick) {
                 *pick = _mm512_add_epi16(both, _mm512_set1_epi32((2 * j) | ((2 * j + 1) << 16)));
             }
+            // The sample itself, of the even and of the odd frame.
+            let itself = _mm512_add_epi16(both, _mm512_set1_epi32(3 | (32 + 3) << 16));
             let (mut ig_now, mut g1_now, mut gg_now, mut lg_now) = (zero, zero, zero, zero);
             for (pair, rows) in source.right.chunks_exact(2).enumerate() {
-                let mut sums = [half; 2];
-                for (sum, row) in sums.iter_mut().zip(rows) {
-                    // SAFETY: 0 <= base <= width - 32.
-                    let window =
-                        unsafe { _mm512_loadu_si512(row.as_ptr().add(base as usize).cast()) };
-                    for j in 0..4 {
-                        let samples = _mm512_permutexvar_epi16(pick[j], window);
-                        *sum = _mm512_dpwssd_epi32(*sum, samples, taps[j]);
-                    }
-                }
-                let even = _mm512_srli_epi32::<16>(sums[0]);
-                let g = _mm512_mask_blend_epi16(0xAAAA_AAAA, even, sums[1]);
-                let word = pair * source.stride + i;
-                // SAFETY: `word + 16` lies within both.
-                let (gradient, grey) = unsafe {
-                    (
-                        _mm512_loadu_si512(source.gradient.as_ptr().add(word).cast()),
-                        _mm512_loadu_si512(source.grey.as_ptr().add(word).cast()),
-                    )
+                // SAFETY: 0 <= base <= width - 32.
+                let windows = unsafe {
+                    [
+                        _mm512_loadu_si512(rows[0].as_ptr().add(base as usize).cast()),
+                        _mm512_loadu_si512(rows[1].as_ptr().add(base as usize).cast()),
+                    ]
                 };
+                let g = if whole {
+                    // Rounds as the taps of phase 0 do.
+                    let samples = _mm512_permutex2var_epi16(windows[0], itself, windows[1]);
+                    _mm512_mulhrs_epi16(samples, quarter)
+                } else {
+                    let mut sums = [half; 2];
+                    for (sum, window) in sums.iter_mut().zip(windows) {
+                        for j in 0..4 {
+                            let samples = _mm512_permutexvar_epi16(pick[j], window);
+                            *sum = _mm512_dpwssd_epi32(*sum, samples, taps[j]);
+                        }
+                    }
+                    let even = _mm512_srli_epi32::<16>(sums[0]);
+                    _mm512_mask_blend_epi16(0xAAAA_AAAA, even, sums[1])
+                };
+                let word = pair * source.stride + i;
+                // SAFETY: `word + 16` lies within the gradients.
+                let gradient =
+                    unsafe { _mm512_loadu_si512(source.gradient.as_ptr().add(word).cast()) };
                 ig_now = _mm512_dpwssd_epi32(ig_now, g, gradient);
-                lg_now = _mm512_dpwssd_epi32(lg_now, g, grey);
+                if LG {
+                    // SAFETY: as above, within the grey values.
+                    let grey = unsafe { _mm512_loadu_si512(source.grey.as_ptr().add(word).cast()) };
+                    lg_now = _mm512_dpwssd_epi32(lg_now, g, grey);
+                }
                 g1_now = _mm512_dpwssd_epi32(g1_now, g, ones);
                 gg_now = _mm512_dpwssd_epi32(gg_now, g, g);
             }
@@ -150,7 +184,9 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             _mm512_storeu_ps(out.ig.as_mut_ptr().add(i), _mm512_cvtepi32_ps(ig));
             _mm512_storeu_ps(out.g.as_mut_ptr().add(i), _mm512_cvtepi32_ps(g1));
             _mm512_storeu_ps(out.gg.as_mut_ptr().add(i), square(gg));
-            _mm512_storeu_ps(out.lg.as_mut_ptr().add(i), square(lg));
+            if let Some(out) = &mut out.lg {
+                _mm512_storeu_ps(out.as_mut_ptr().add(i), square(lg));
+            }
         }
     }
     blocks * 16

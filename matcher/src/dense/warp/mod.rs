@@ -44,8 +44,8 @@ pub(crate) struct Warped<'a> {
     pub g: &'a mut [f32],
     /// Sum over time of the squared right grey value, in [`super::gradient::SQUARE_UNIT`].
     pub gg: &'a mut [f32],
-    /// Sum over time of left times right grey value, in the same unit.
-    pub lg: &'a mut [f32],
+    /// Sum over time of left times right grey value, in the same unit, where it is wanted.
+    pub lg: Option<&'a mut [f32]>,
 }
 
 /// Warps one row. Grey values are in 1/16 of an 8-bit grey level.
@@ -56,7 +56,7 @@ pub(crate) fn warp_row(level: Level, source: &Source<'_>, out: &mut Warped<'_>) 
     assert!(source.right.iter().all(|r| r.len() == width));
     let words = source.right.len() / 2 * source.stride;
     assert!(len <= source.stride && source.gradient.len() >= words && source.grey.len() >= words);
-    for map in [&out.at, &out.valid, &out.ig, &out.g, &out.gg, &out.lg] {
+    for map in [&out.at, &out.valid, &out.ig, &out.g, &out.gg].into_iter().chain(&out.lg) {
         assert!(map.len() >= len);
     }
     let kernels = Kernels::get();
@@ -106,7 +106,11 @@ mod tests {
         let [at, valid, ig, g, gg, lg] = &mut maps;
         let source =
             Source { right: &rows, x0, w, gradient: &gradient, grey: &grey, stride: w.len() };
-        warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg });
+        warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg: Some(lg) });
+        let mut without: [Vec<f32>; 5] = std::array::from_fn(|_| vec![7.0; w.len()]);
+        let [at, valid, ig, g, gg] = &mut without;
+        warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg: None });
+        assert!(without.iter().zip(&maps).all(|(a, b)| a == b), "{level}");
         maps
     }
 
@@ -119,9 +123,14 @@ mod tests {
             let rows: Vec<Vec<Sample>> = (0..10)
                 .map(|_| (0..width).map(|_| (random.bits() % 16_321) as i16).collect())
                 .collect();
-            for roughness in [0.3, 8.0, 120.0] {
+            for (roughness, whole) in
+                [(0.3, false), (8.0, false), (120.0, false), (0.0, true), (0.6, true), (60.0, true)]
+            {
                 let mut w: Vec<f32> = (0..len)
-                    .map(|i| (3.0 + 0.1 * i as f64 + roughness * (random.unit() - 0.5)) as f32)
+                    .map(|i| {
+                        let w = 3.0 + 0.1 * i as f64 + roughness * (random.unit() - 0.5);
+                        (if whole { w.round() } else { w }) as f32
+                    })
                     .collect();
                 w[3] = f32::NAN;
                 w[5] = f32::INFINITY;

@@ -44,6 +44,8 @@ pub(super) fn pixels(
         out.ig[i] = ig as f32;
         out.g[i] = g1 as f32;
         out.gg[i] = square(gg);
-        out.lg[i] = square(lg);
+        if let Some(out) = &mut out.lg {
+            out[i] = square(lg);
+        }
     }
 }

@@ -72,7 +72,7 @@ pub(crate) fn warp_moving_row(
     assert!(source.right.iter().all(|r| r.len() == width));
     let words = source.right.len() / 2 * source.stride;
     assert!(len <= source.stride && source.gradient.len() >= words && source.grey.len() >= words);
-    for map in [&out.at, &out.valid, &out.ig, &out.g, &out.gg, &out.lg] {
+    for map in [&out.at, &out.valid, &out.ig, &out.g, &out.gg].into_iter().chain(&out.lg) {
         assert!(map.len() >= len);
     }
     scratch.resize(len);
@@ -187,7 +187,11 @@ fn finish_loop(w: &[f32], scratch: &Scratch, out: &mut Warped<'_>) {
         out.ig[i] = keep(ig[i]);
         out.g[i] = keep(g1[i]);
         out.gg[i] = keep(gg[i].wrapping_add(half) >> SQUARE_SHIFT);
-        out.lg[i] = keep(lg[i].wrapping_add(half) >> SQUARE_SHIFT);
+    }
+    let Some(out_lg) = &mut out.lg else { return };
+    for i in 0..n {
+        let sum = lg[i].wrapping_add(half) >> SQUARE_SHIFT;
+        out_lg[i] = if out.valid[i] > 0.5 { sum as f32 } else { 0.0 };
     }
 }
 
@@ -254,7 +258,7 @@ mod tests {
         let (gradient, grey) = (&input.gradient[..], &input.grey[..]);
         let source = Source { right: &rows, x0, w, gradient, grey, stride: len };
         let moving = Moving { rate: &input.rate, offsets: &input.offsets };
-        let mut out = Warped { at, valid, ig, g, gg, lg };
+        let mut out = Warped { at, valid, ig, g, gg, lg: Some(lg) };
         warp_moving_row(level, &source, &moving, &mut Scratch::default(), &mut out);
         maps
     }
@@ -289,7 +293,11 @@ mod tests {
         let [at, valid, ig, g, gg, lg] = &mut maps;
         let (w, gradient, grey) = (&input.w[..], &input.gradient[..], &input.grey[..]);
         let source = Source { right: &rows, x0: 0, w, gradient, grey, stride: 200 };
-        super::super::warp_row(Level::best(), &source, &mut Warped { at, valid, ig, g, gg, lg });
+        super::super::warp_row(
+            Level::best(),
+            &source,
+            &mut Warped { at, valid, ig, g, gg, lg: Some(lg) },
+        );
         assert_eq!(moving[1..], maps[1..]);
         for (a, b) in moving[0].iter().zip(&maps[0]) {
             assert!((a - b).abs() < 1e-5, "{a} {b}");
