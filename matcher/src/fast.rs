@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::{
-    Image, Level, Params, ShapeFunction, StereoStack,
+    Image, Level, Matched, Params, ShapeFunction, StereoStack,
     coarse::{Coarse, CoarseMap, INVALID},
     dense::{
         DenseFit, DenseMaps, mark_steps,
@@ -29,14 +29,6 @@ pub(crate) struct Fast {
     regions: Regions,
 }
 
-/// Maps of a frame on the left canvas, NaN together.
-pub(crate) struct Found {
-    pub disparity: Image<f32>,
-    pub zncc: Image<f32>,
-    /// Rate of the disparity in px per second, or per frame where the stack has no times.
-    pub rate: Option<Image<f32>>,
-}
-
 impl Fast {
     pub(crate) fn new(level: Level, params: &Params) -> Self {
         let a = &params.advanced;
@@ -55,12 +47,14 @@ impl Fast {
         }
     }
 
-    /// Disparity, ZNCC and rate of a checked stack; `done` is told the name of each stage at its end.
+    /// Fills the maps of `out` from a checked stack; the rate is in px per second, or per frame where
+    /// the stack has no times. `done` is told the name of each stage at its end.
     pub(crate) fn run(
         &mut self,
         stack: &StereoStack<'_>,
+        out: &mut Matched,
         mut done: impl FnMut(&'static str),
-    ) -> Found {
+    ) {
         let (width, height) = (stack.width(), stack.height());
         if (self.start.width(), self.start.height()) != (width, height) {
             self.start = Image::new(width, height, f32::NAN);
@@ -85,35 +79,62 @@ impl Fast {
             let rate =
                 self.motion.run(stack, &mut self.fit, &self.start, &self.step, &mut self.maps);
             done("motion");
-            Some(rate.unwrap_or_else(|| Image::new(width, height, 0.0)))
+            rate
         } else {
             None
         };
-        let mut disparity = Image::new(width, height, f32::NAN);
+        for map in [&mut out.disparity_px, &mut out.zncc] {
+            fit_size(map, width, height);
+        }
+        let disparity = &mut out.disparity_px;
         let zncc_min = self.params.zncc_min;
         let DenseMaps { first_px, second_px, zncc } = &mut self.maps;
         match self.params.shape {
-            ShapeFunction::First => accept(first_px, zncc_min, zncc, &mut disparity),
-            ShapeFunction::Second => accept(second_px, zncc_min, zncc, &mut disparity),
+            ShapeFunction::First => accept(first_px, zncc_min, zncc, disparity),
+            ShapeFunction::Second => accept(second_px, zncc_min, zncc, disparity),
             ShapeFunction::Auto => {
-                self.order.choose(self.level, zncc_min, &mut self.maps, &mut disparity);
+                self.order.choose(self.level, zncc_min, &mut self.maps, disparity);
             }
         }
         done("order");
-        self.regions.remove(&mut disparity, self.params.advanced.region_min);
-        let mut zncc = self.maps.zncc.clone();
-        for (z, d) in zncc.as_mut_slice().iter_mut().zip(disparity.as_slice()) {
-            *z = if d.is_nan() { f32::NAN } else { *z };
+        self.regions.remove(disparity, self.params.advanced.region_min);
+        invalid_together(disparity, Some(&self.maps.zncc), &mut out.zncc);
+        if self.params.motion && stack.times_s.is_some() {
+            let rates = out.rate_px_per_s.get_or_insert_with(|| Image::new(0, 0, 0.0));
+            fit_size(rates, width, height);
+            invalid_together(disparity, rate.as_ref(), rates);
+        } else {
+            out.rate_px_per_s = None;
         }
-        let rate = rate.map(|mut rate| {
-            for (v, d) in rate.as_mut_slice().iter_mut().zip(disparity.as_slice()) {
-                *v = if d.is_nan() { f32::NAN } else { *v };
-            }
-            rate
-        });
         done("regions");
-        Found { disparity, zncc, rate }
     }
+}
+
+fn fit_size(map: &mut Image<f32>, width: usize, height: usize) {
+    if (map.width(), map.height()) != (width, height) {
+        *map = Image::new(width, height, f32::NAN);
+    }
+}
+
+/// Copies `from`, or zeros, to where the disparity is valid, and NaN elsewhere.
+fn invalid_together(disparity: &Image<f32>, from: Option<&Image<f32>>, to: &mut Image<f32>) {
+    let width = to.width().max(1);
+    let bands = to.as_mut_slice().par_chunks_mut(64 * width);
+    bands.zip(disparity.as_slice().par_chunks(64 * width)).enumerate().for_each(
+        |(band, (to, disparity))| match from {
+            Some(from) => {
+                let from = &from.as_slice()[band * 64 * width..];
+                for ((to, v), d) in to.iter_mut().zip(from).zip(disparity) {
+                    *to = if d.is_nan() { f32::NAN } else { *v };
+                }
+            }
+            None => {
+                for (to, d) in to.iter_mut().zip(disparity) {
+                    *to = if d.is_nan() { f32::NAN } else { 0.0 };
+                }
+            }
+        },
+    );
 }
 
 /// The coarse map as the fit's start, without what the masks exclude.

@@ -17,6 +17,7 @@ pub mod icgn;
 pub mod image;
 mod lanes;
 pub mod level;
+pub mod machine;
 pub mod matched;
 pub mod parabola;
 pub mod parallel;

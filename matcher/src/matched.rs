@@ -27,3 +27,16 @@ pub struct Matched {
     /// Time of each stage, in order.
     pub stages: Vec<StageTime>,
 }
+
+impl Default for Matched {
+    /// Empty maps, for [`crate::Matcher::match_into`].
+    fn default() -> Self {
+        Self {
+            disparity_px: Image::new(0, 0, f32::NAN),
+            zncc: Image::new(0, 0, f32::NAN),
+            at_newest: false,
+            rate_px_per_s: None,
+            stages: Vec::new(),
+        }
+    }
+}

@@ -3,7 +3,7 @@
 //! Every loop hands each task its own rows to write, so results do not depend on the number of
 //! threads.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use rayon::prelude::*;
 
@@ -47,6 +47,31 @@ impl Pool {
     /// Number of threads loops are spread over.
     pub fn threads(&self) -> usize {
         self.0.as_ref().map_or_else(rayon::current_num_threads, |p| p.current_num_threads())
+    }
+}
+
+/// Buffers for parallel loops, one per thread, kept between frames.
+#[derive(Debug)]
+pub(crate) struct PerThread<T>(Vec<Mutex<T>>);
+
+impl<T> Default for PerThread<T> {
+    fn default() -> Self {
+        Self(Vec::new())
+    }
+}
+
+impl<T: Default> PerThread<T> {
+    /// Makes buffers for all threads of the current pool; call it before a loop.
+    pub(crate) fn ready(&mut self) -> &Self {
+        let threads = rayon::current_num_threads().max(1);
+        self.0.resize_with(threads.max(self.0.len()), Mutex::default);
+        self
+    }
+
+    /// Calls `work` with the current thread's buffers.
+    pub(crate) fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> R {
+        let thread = rayon::current_thread_index().unwrap_or(0) % self.0.len();
+        work(&mut self.0[thread].lock().unwrap_or_else(|e| e.into_inner()))
     }
 }
 

@@ -79,13 +79,25 @@ impl Matcher {
     /// # Errors
     /// [`Error::FrameCount`] and [`Error::Shape`] for a stack that cannot be matched.
     pub fn match_stack(&mut self, stack: &StereoStack<'_>) -> Result<Matched, Error> {
+        let mut out = Matched::default();
+        self.match_into(stack, &mut out)?;
+        Ok(out)
+    }
+
+    /// As [`Self::match_stack`], in place of what `out` holds: with [`Method::Dense`] and stacks of
+    /// one size, a loop that keeps its result takes no new memory from the second frame on.
+    ///
+    /// # Errors
+    /// As there; `out` is then as it was.
+    pub fn match_into(&mut self, stack: &StereoStack<'_>, out: &mut Matched) -> Result<(), Error> {
         stack.check()?;
         let pool = self.pool.clone();
         pool.install(|| match self.params.method {
-            Method::Parabola => Ok(self.parabola(stack)),
-            Method::IcGn => Ok(self.icgn(stack)),
-            Method::Dense => Ok(self.dense(stack)),
-        })
+            Method::Parabola => *out = self.parabola(stack),
+            Method::IcGn => *out = self.icgn(stack),
+            Method::Dense => self.dense(stack, out),
+        });
+        Ok(())
     }
 
     /// The coarse search and its checks.
@@ -108,22 +120,17 @@ impl Matcher {
     }
 
     /// Descriptors, their search, and dense least squares.
-    fn dense(&mut self, stack: &StereoStack<'_>) -> Matched {
-        let mut clock = Clock::start();
+    fn dense(&mut self, stack: &StereoStack<'_>, out: &mut Matched) {
+        let mut clock = Clock::start(std::mem::take(&mut out.stages));
         let Self { fast, level, params, .. } = self;
         let fast = fast.get_or_insert_with(|| Fast::new(*level, params));
-        let found = fast.run(stack, |stage| clock.stage(stage));
-        Matched {
-            disparity_px: found.disparity,
-            zncc: found.zncc,
-            at_newest: found.rate.is_some(),
-            rate_px_per_s: found.rate.filter(|_| stack.times_s.is_some()),
-            stages: clock.stages,
-        }
+        fast.run(stack, out, |stage| clock.stage(stage));
+        out.at_newest = params.motion;
+        out.stages = clock.stages;
     }
 
     fn parabola(&mut self, stack: &StereoStack<'_>) -> Matched {
-        let mut clock = Clock::start();
+        let mut clock = Clock::start(Vec::new());
         let coarse = self.coarse(stack, &mut clock);
         let zncc = Image::new(stack.width(), stack.height(), f32::NAN);
         Matched {
@@ -137,7 +144,7 @@ impl Matcher {
 
     /// The coarse search, refined by Stereo-DIC.
     fn icgn(&mut self, stack: &StereoStack<'_>) -> Matched {
-        let mut clock = Clock::start();
+        let mut clock = Clock::start(Vec::new());
         let coarse = self.coarse(stack, &mut clock);
         self.prepared.fill(stack, self.params.advanced.interpolation);
         self.map.fill(&coarse.disparity_px);
@@ -169,8 +176,10 @@ struct Clock {
 }
 
 impl Clock {
-    fn start() -> Self {
-        Self { last: Instant::now(), stages: Vec::new() }
+    /// Times a frame, in the memory of another one's times.
+    fn start(mut stages: Vec<StageTime>) -> Self {
+        stages.clear();
+        Self { last: Instant::now(), stages }
     }
 
     fn stage(&mut self, stage: &'static str) {

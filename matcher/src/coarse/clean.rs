@@ -8,12 +8,25 @@ use super::{
     descriptor::{Descriptors, MARGIN},
     search::UNSURE_COST,
 };
-use crate::{Image, Level, lanes::vectorised};
+use crate::{Image, Level, lanes::vectorised, parallel::PerThread};
 
 /// An outlier that matches better than its neighbours' disparity by more bits stays: a thin object.
 const THIN_BITS: u32 = 5;
 /// Left pixels this near may share a right pixel: a surface seen at a slant.
 const SHARED_PX: usize = 2;
+
+/// Rows of a task.
+const BAND: usize = 16;
+/// Pixels that are passed over together where none is an outlier.
+const BLOCK: usize = 32;
+
+/// A row's buffers.
+#[derive(Debug, Default)]
+pub(crate) struct Rows {
+    median: Vec<i16>,
+    suspect: Vec<u8>,
+    claims: Vec<u32>,
+}
 
 /// Replaces outliers of `map` by the median of their 3x3 neighbours, into `out`.
 pub(crate) fn replace_outliers(
@@ -21,33 +34,53 @@ pub(crate) fn replace_outliers(
     left: &Descriptors,
     right: &Descriptors,
     map: &CoarseMap,
+    rows: &PerThread<Rows>,
     out: &mut CoarseMap,
 ) {
     let (width, height) = (map.disparity.width(), map.disparity.height());
-    out.disparity
-        .as_mut_slice()
-        .par_chunks_mut(width * 16)
-        .zip(out.cost.as_mut_slice().par_chunks_mut(width * 16))
-        .enumerate()
-        .for_each_init(
-            || vec![0i16; width],
-            |median, (band, (disparity, cost))| {
+    let bands = out.disparity.as_mut_slice().par_chunks_mut(width * BAND);
+    bands.zip(out.cost.as_mut_slice().par_chunks_mut(width * BAND)).enumerate().for_each(
+        |(band, (disparity, cost))| {
+            rows.with(|Rows { median, suspect, .. }| {
+                median.resize(width, 0);
+                suspect.resize(width, 0);
                 let rows = disparity.chunks_mut(width).zip(cost.chunks_mut(width));
                 for (i, (disparity, cost)) in rows.enumerate() {
-                    let y = band * 16 + i;
+                    let y = band * BAND + i;
                     disparity.copy_from_slice(map.disparity.row(y));
                     cost.copy_from_slice(map.cost.row(y));
                     medians(level, &map.disparity, y, height, median);
-                    for x in 0..width {
-                        if median[x].abs_diff(disparity[x]) > 1 || u32::from(cost[x]) > UNSURE_COST
-                        {
+                    vectorised!(
+                        level,
+                        suspect_loop(
+                            median: &[i16] = median,
+                            disparity: &[i16] = disparity,
+                            cost: &[u8] = cost,
+                            suspect: &mut [u8] = suspect,
+                        )
+                    );
+                    for (block, suspects) in suspect.chunks(BLOCK).enumerate() {
+                        if suspects.iter().fold(0, |any, s| any | s) == 0 {
+                            continue;
+                        }
+                        for (x, _) in (block * BLOCK..).zip(suspects).filter(|(_, s)| **s != 0) {
                             let bits = |d: i32| distance(left, right, x, y, d);
                             settle(median[x], bits, &mut disparity[x], &mut cost[x]);
                         }
                     }
                 }
-            },
-        );
+            });
+        },
+    );
+}
+
+/// Non-zero where a disparity is another than its neighbours' or matches badly.
+#[inline(always)]
+fn suspect_loop(median: &[i16], disparity: &[i16], cost: &[u8], suspect: &mut [u8]) {
+    for (((s, m), d), c) in suspect.iter_mut().zip(median).zip(disparity).zip(cost) {
+        let (low, high) = (m.saturating_sub(1), m.saturating_add(1));
+        *s = u8::from(*d < low) | u8::from(*d > high) | u8::from(u32::from(*c) > UNSURE_COST);
+    }
 }
 
 /// Decides between a pixel's own disparity and its neighbours' `median`.
@@ -133,15 +166,15 @@ fn median(v: [i16; 9]) -> i16 {
 
 /// The left-right check: a right pixel belongs to the left pixel that matches it best; others that
 /// claim it from farther away are occluded or wrong, and become invalid.
-pub(crate) fn left_right(map: &mut CoarseMap) {
+pub(crate) fn left_right(map: &mut CoarseMap, rows: &PerThread<Rows>) {
     let width = map.disparity.width();
     map.disparity
         .as_mut_slice()
-        .par_chunks_mut(width * 16)
-        .zip(map.cost.as_slice().par_chunks(width * 16))
-        .for_each_init(
-            || vec![u32::MAX; width],
-            |claims, (disparity, cost)| {
+        .par_chunks_mut(width * BAND)
+        .zip(map.cost.as_slice().par_chunks(width * BAND))
+        .for_each(|(disparity, cost)| {
+            rows.with(|Rows { claims, .. }| {
+                claims.resize(width, u32::MAX);
                 for (disparity, cost) in disparity.chunks_mut(width).zip(cost.chunks(width)) {
                     claims.fill(u32::MAX);
                     let counterpart = |x: usize, d: i16| (x as i32 - i32::from(d)) as usize;
@@ -160,8 +193,8 @@ pub(crate) fn left_right(map: &mut CoarseMap) {
                         }
                     }
                 }
-            },
-        );
+            });
+        });
 }
 
 #[cfg(test)]
@@ -188,7 +221,8 @@ mod tests {
         map.cost.set(4, 0, 9);
         map.disparity.set(9, 0, 6);
         map.cost.set(9, 0, 2);
-        left_right(&mut map);
+        let mut rows = PerThread::default();
+        left_right(&mut map, rows.ready());
         assert_eq!(map.disparity.get(4, 0), Some(INVALID));
         assert_eq!(map.disparity.get(9, 0), Some(6));
     }

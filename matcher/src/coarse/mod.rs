@@ -10,7 +10,7 @@ pub(crate) mod descriptor;
 pub(crate) mod hamming;
 mod search;
 
-use crate::{DisparityRange, Image, Level, StereoStack};
+use crate::{DisparityRange, Image, Level, StereoStack, parallel::PerThread};
 use descriptor::Descriptors;
 use search::{Scene, Search};
 
@@ -51,6 +51,7 @@ pub struct Coarse {
     right: Descriptors,
     search: Search,
     raw: CoarseMap,
+    rows: PerThread<clean::Rows>,
 }
 
 impl Coarse {
@@ -63,6 +64,7 @@ impl Coarse {
             right: Descriptors::default(),
             search: Search::default(),
             raw: CoarseMap::new(0, 0),
+            rows: PerThread::default(),
         }
     }
 
@@ -90,8 +92,9 @@ impl Coarse {
             return;
         }
         self.search.run(&scene, &mut self.raw);
-        clean::replace_outliers(self.level, &self.left, &self.right, &self.raw, map);
-        clean::left_right(map);
+        let rows = self.rows.ready();
+        clean::replace_outliers(self.level, &self.left, &self.right, &self.raw, rows, map);
+        clean::left_right(map, rows);
     }
 
     /// What [`Coarse::search`] is measured against: every candidate for every pixel.

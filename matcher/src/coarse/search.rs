@@ -1,8 +1,6 @@
 //! Where to look: seeds over the whole range on few pixels, then each block among its neighbours'
 //! seeds, and over the whole range again where that finds no match.
 
-use std::{cell::RefCell, sync::Mutex};
-
 use rayon::prelude::*;
 
 use super::{
@@ -10,7 +8,7 @@ use super::{
     descriptor::{Descriptors, MARGIN},
     hamming::{BLOCK, best_candidates},
 };
-use crate::{DisparityRange, Image, Level, Sample};
+use crate::{DisparityRange, Image, Level, Sample, parallel::PerThread};
 
 /// Rows between seed rows, and rows of a block.
 pub(crate) const SEED_ROWS: usize = 16;
@@ -71,7 +69,7 @@ impl Set {
 pub(crate) struct Search {
     /// Best disparity of every second pixel of the seed rows; [`INVALID`] where none.
     seeds: Vec<i16>,
-    scratch: Vec<Mutex<Scratch>>,
+    scratch: PerThread<Scratch>,
 }
 
 #[derive(Debug, Default)]
@@ -106,20 +104,13 @@ impl Search {
     /// Fills `map` with each pixel's best candidate.
     pub(crate) fn run(&mut self, scene: &Scene<'_>, map: &mut CoarseMap) {
         let (width, height) = (map.disparity.width(), map.disparity.height());
-        let threads = rayon::current_num_threads().max(1);
-        self.scratch.resize_with(threads.max(self.scratch.len()), Mutex::default);
         let half = width.div_ceil(2);
         let bands = height.div_ceil(SEED_ROWS);
         self.seeds.resize(half * bands, INVALID);
-        let scratch = &self.scratch;
-        let with = |work: &dyn Fn(&mut Scratch)| {
-            let thread = rayon::current_thread_index().unwrap_or(0) % scratch.len();
-            work(&mut scratch[thread].lock().unwrap_or_else(|e| e.into_inner()));
-        };
+        let scratch = self.scratch.ready();
         self.seeds.par_chunks_mut(half).enumerate().for_each(|(band, seeds)| {
             let y = (band * SEED_ROWS + SEED_ROWS / 2).min(height - 1);
-            let seeds = RefCell::new(seeds);
-            with(&|s| seed_row(scene, y, s, &mut seeds.borrow_mut()));
+            scratch.with(|s| seed_row(scene, y, s, seeds));
         });
         let seeds = &self.seeds;
         map.disparity
@@ -130,9 +121,8 @@ impl Search {
             .for_each(|(band, (disparity, cost))| {
                 let first = band.saturating_sub(1) * half;
                 let last = (band + 2).min(bands) * half;
-                let out = RefCell::new(Band { y: band * SEED_ROWS, width, disparity, cost });
-                with(&|s| {
-                    let mut out = out.borrow_mut();
+                let mut out = Band { y: band * SEED_ROWS, width, disparity, cost };
+                scratch.with(|s| {
                     for x in (0..width).step_by(BLOCK) {
                         search_block(scene, &seeds[first..last], x, s, &mut out);
                     }

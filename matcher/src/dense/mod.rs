@@ -24,11 +24,9 @@ mod steps;
 pub(crate) mod tile;
 pub(crate) mod warp;
 
-use std::sync::Mutex;
-
 use rayon::prelude::*;
 
-use crate::{Image, Level, Sample, ShapeFunction, StereoStack};
+use crate::{Image, Level, Sample, ShapeFunction, StereoStack, parallel::PerThread};
 use motion::{BLOCK, Motion};
 use solve::Fits;
 pub use steps::mark_steps;
@@ -46,7 +44,7 @@ pub struct DenseFit {
     radius: usize,
     shape: ShapeFunction,
     surface_px: f32,
-    tiles: Vec<Mutex<Tile>>,
+    tiles: PerThread<Tile>,
     zero: Image<Sample>,
 }
 
@@ -77,7 +75,7 @@ impl DenseFit {
             radius: radius.clamp(2, 8),
             shape,
             surface_px,
-            tiles: Vec::new(),
+            tiles: PerThread::default(),
             zero: Image::new(0, 0, 0),
         }
     }
@@ -124,7 +122,6 @@ impl DenseFit {
             self.zero = Image::new(width, height, 0);
         }
         let threads = rayon::current_num_threads().max(1);
-        self.tiles.resize_with(threads.max(self.tiles.len()), Mutex::default);
         let frames = stack.frames();
         let mut left = [&self.zero; 16];
         let mut right = [&self.zero; 16];
@@ -144,7 +141,7 @@ impl DenseFit {
             origin: origin(start),
             motion: again.map(|(motion, _)| motion),
         };
-        let tiles = &self.tiles;
+        let tiles = self.tiles.ready();
         // Results do not depend on where bands end.
         let band_rows = match again {
             None => height.div_ceil(2 * threads).max(BAND),
@@ -159,17 +156,17 @@ impl DenseFit {
             .zip(zncc.as_mut_slice().par_chunks_mut(rows))
             .enumerate()
             .for_each(|(band, ((first, second), zncc))| {
-                let thread = rayon::current_thread_index().unwrap_or(0) % tiles.len();
-                let mut tile = tiles[thread].lock().unwrap_or_else(|e| e.into_inner());
                 let mut out = Output { first, second, zncc };
-                for (from, to) in columns(width, band, again.map(|(_, moving)| moving)) {
-                    let strips = (to - from).div_ceil(STRIP);
-                    for strip in 0..strips {
-                        let part = |k: usize| from + (to - from) * k / strips;
-                        let columns = (part(strip), part(strip + 1));
-                        tile.run(&job, columns, band * band_rows, &mut out);
+                tiles.with(|tile| {
+                    for (from, to) in columns(width, band, again.map(|(_, moving)| moving)) {
+                        let strips = (to - from).div_ceil(STRIP);
+                        for strip in 0..strips {
+                            let part = |k: usize| from + (to - from) * k / strips;
+                            let columns = (part(strip), part(strip + 1));
+                            tile.run(&job, columns, band * band_rows, &mut out);
+                        }
                     }
-                }
+                });
             });
     }
 }

@@ -14,8 +14,6 @@
 //!
 //! What is noise is told by the median of changes of e over the image, scaled by each pixel's ZNCC.
 
-use std::sync::Mutex;
-
 use rayon::prelude::*;
 
 use super::{
@@ -25,6 +23,7 @@ use super::{
 use crate::{
     Image, Level,
     lanes::{WIDEST, vectorised},
+    parallel::PerThread,
 };
 
 /// Radius of the smoothing: 13 x 13 pixels.
@@ -56,7 +55,7 @@ const BAND: usize = 64;
 /// Chooses orders; keeps its buffers between frames.
 #[derive(Debug, Default)]
 pub struct OrderChoice {
-    bands: Vec<Mutex<Buffers>>,
+    bands: PerThread<Buffers>,
     sample: Vec<f32>,
 }
 
@@ -91,31 +90,28 @@ impl OrderChoice {
     ) {
         let (width, height) = (maps.first_px.width(), maps.first_px.height());
         let sigma = self.sigma(maps);
-        let threads = rayon::current_num_threads().max(1);
-        self.bands.resize_with(threads.max(self.bands.len()), Mutex::default);
-        let bands = &self.bands;
+        let bands = self.bands.ready();
         let DenseMaps { first_px, second_px, zncc } = maps;
         out.as_mut_slice()
             .par_chunks_mut(width * BAND)
             .zip(zncc.as_mut_slice().par_chunks_mut(width * BAND))
             .enumerate()
             .for_each(|(band, (out, zncc))| {
-                let thread = rayon::current_thread_index().unwrap_or(0) % bands.len();
-                let mut b = bands[thread].lock().unwrap_or_else(|e| e.into_inner());
-                b.resize(width);
-                let top = band * BAND;
-                let rows = out.len() / width;
-                for y in top..top + rows + 2 * RADIUS {
-                    // Row y - RADIUS enters, row y - 2 RADIUS is finished.
-                    let enters = y.checked_sub(RADIUS).filter(|&y| y < height);
-                    b.enter(level, enters.map(|y| (first_px.row(y), second_px.row(y))), y);
-                    if let Some(row) = (y - top).checked_sub(2 * RADIUS) {
-                        let at = row * width..(row + 1) * width;
-                        let estimates = (first_px.row(top + row), second_px.row(top + row));
-                        let (zncc, out) = (&mut zncc[at.clone()], &mut out[at]);
-                        b.finish(level, y - RADIUS, estimates, (sigma, zncc_min), zncc, out);
+                bands.with(|b| {
+                    b.resize(width);
+                    let top = band * BAND;
+                    let rows = out.len() / width;
+                    for y in top..top + rows + 2 * RADIUS {
+                        // Row y - RADIUS enters, row y - 2 RADIUS is finished.
+                        let enters = y.checked_sub(RADIUS).filter(|&y| y < height);
+                        b.enter(level, enters.map(|y| (first_px.row(y), second_px.row(y))), y);
+                        if let Some(row) = (y - top).checked_sub(2 * RADIUS) {
+                            let at = row * width..(row + 1) * width;
+                            let estimates = (first_px.row(top + row), second_px.row(top + row));
+                            let (zncc, out) = (&mut zncc[at.clone()], &mut out[at]);
+                            b.finish(level, y - RADIUS, estimates, (sigma, zncc_min), zncc, out);
                     }
-                }
+                });
             });
     }
 

@@ -87,6 +87,8 @@ pub(crate) struct Descriptors {
     width: usize,
     stride: usize,
     data: Aligned<u64>,
+    /// The tests for the last number of frames.
+    tests: Option<(usize, [Test; 64])>,
 }
 
 impl Descriptors {
@@ -106,7 +108,10 @@ impl Descriptors {
         self.width = width;
         self.stride = width.next_multiple_of(BLOCK) + 2 * MARGIN;
         self.data.resize(self.stride * images[0].height(), OUTSIDE);
-        let tests = tests(images.len());
+        let tests = match self.tests {
+            Some((frames, tests)) if frames == images.len() => tests,
+            _ => self.tests.insert((images.len(), tests(images.len()))).1,
+        };
         let stride = self.stride;
         self.data.par_chunks_mut(stride * BAND).enumerate().for_each(|(band, rows)| {
             for row in rows.chunks_mut(stride) {
@@ -372,8 +377,9 @@ fn enter_loop(
     let inner = &mut new[before..before + count];
     let (blocks, rest) = inner.as_chunks_mut::<BLOCK>();
     let done = blocks.len() * BLOCK;
-    let mean =
-        |sum: i16| (i32::from(sum.wrapping_add(scale.round)) * i32::from(scale.time) >> 16) as i16;
+    let mean = |sum: i16| {
+        ((i32::from(sum.wrapping_add(scale.round)) * i32::from(scale.time)) >> 16) as i16
+    };
     for (b, light) in blocks.iter_mut().enumerate() {
         let mut sum = [0i16; BLOCK];
         for row in rows {
@@ -403,7 +409,7 @@ fn enter_loop(
 fn means_loop(column: &[i16], scale: Scale, mean: &mut [i16]) {
     let count = mean.len();
     let finish = |sum: i16| {
-        let scaled = i32::from(sum << scale.up) * i32::from(scale.space) >> 16;
+        let scaled = (i32::from(sum << scale.up) * i32::from(scale.space)) >> 16;
         (scaled as i16) << scale.back
     };
     if scale.radius == 2 {

@@ -62,6 +62,14 @@ fn simulated(_: usize, _: &Output) -> Result<(StereoCalibration, Vec<StereoPair>
     Err(Failure::new(Kind::Usage, "no recording folder").remedy("this build has no simulator"))
 }
 
+/// Largest memory that the process has held so far, simulation and all raw images included, in MiB;
+/// `None` where the system does not say.
+fn peak_resident_mib() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    line.split_whitespace().next()?.parse::<f64>().ok().map(|kib| kib / 1024.0)
+}
+
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let (calibration, pairs) = input(args, output)?;
@@ -124,6 +132,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let wall_ms: f64 = outer.iter().map(|s| s.wall_ms).sum();
     let cpu_ms: Option<f64> = outer.iter().map(|s| s.cpu_ms).sum();
     let geometry = stack.rectifier.geometry();
+    let machine = stspp_matcher::machine::measure(matcher.level());
     let samples = (geometry.width * geometry.height * stack.len()) as f64;
     let json = json!({
         "total_wall_ms": wall_ms,
@@ -140,6 +149,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         "points_per_s": points as f64 / wall_ms * 1e3,
         "cpu_ns_per_sample": cpu_ms.map(|ms| ms * 1e6 / samples),
         "repeat": args.repeat,
+        "machine": {
+            "popcount_g_per_s": machine.popcount_g_per_s,
+            "fma_gflop_per_s": machine.fma_gflop_per_s,
+        },
+        "peak_resident_mib": peak_resident_mib(),
         "parameters": report::params_json(matcher.params()),
         "versions": report::versions_json(),
     });
@@ -159,6 +173,10 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         stack.len(),
         matcher.threads(),
         matcher.level(),
+    );
+    text += &format!(
+        "machine, one core: {:.1} G descriptor comparisons/s, {:.0} GFLOP/s of multiply-adds\n",
+        machine.popcount_g_per_s, machine.fma_gflop_per_s,
     );
     output.result(&text, &json);
     Ok(())
