@@ -4,6 +4,7 @@ mod arrows;
 mod debian;
 mod e2e;
 mod firmware;
+mod kernels;
 mod licences;
 mod stage;
 mod test;
@@ -21,6 +22,8 @@ cargo xtask firmware [f330] [f350] [--install] [--exercise] [--test]
                              --install gets the compiler's target, --test runs its host tests
 cargo xtask firmware flash f330|f350 [--check] [ELF]
                              checks an image and writes it with a debug probe (probe-rs)
+cargo xtask kernels          checks the matcher's kernels under valgrind, compares their instruction
+                             counts, and lets a compiler check the NEON ones
 cargo xtask e2e [NAME]       plugs the simulated sensor into a Debian kernel in QEMU and tries the
                              stspp binary there: all scenarios, or those with NAME in their name
 cargo xtask help             this text";
@@ -33,6 +36,7 @@ fn main() -> ExitCode {
         ["test", "--quick"] => return test::run(test::Depth::Quick),
         ["e2e"] => e2e::run(None),
         ["e2e", only] => e2e::run(Some(only)),
+        ["kernels"] => return test::kernels(),
         ["arrows"] => workspace::metadata().and_then(|m| arrows::check(&m)),
         ["licences"] => workspace::metadata().and_then(|m| licences::check(&m)),
         ["firmware", rest @ ..] => firmware::run(rest),

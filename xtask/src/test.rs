@@ -2,7 +2,7 @@
 //! one failed, so that one run shows all that is wrong.
 
 use crate::stage::{self, Outcome, Stage};
-use crate::{arrows, firmware, licences, workspace};
+use crate::{arrows, firmware, kernels, licences, workspace};
 use std::process::{Command, ExitCode};
 
 /// How much to test.
@@ -71,7 +71,29 @@ pub fn run(depth: Depth) -> ExitCode {
             stage::command(cargo(&["test", "--locked", "--workspace", "--no-fail-fast"]))
         }),
     ];
-    summarise(&stages)
+    let deeper: Vec<Stage> =
+        KERNELS.map(|(name, work)| stage::run(name, || full(depth, work))).into();
+    summarise(&[stages, deeper].concat())
+}
+
+/// The matcher's kernels beyond their tests.
+const KERNELS: [(&str, fn() -> Outcome); 3] = [
+    ("memory check", kernels::memory_check),
+    ("instruction counts", kernels::instruction_counts),
+    ("NEON kernels", kernels::aarch64),
+];
+
+/// Runs those stages alone.
+pub fn kernels() -> ExitCode {
+    summarise(&KERNELS.map(|(name, work)| stage::run(name, work)))
+}
+
+/// A stage that needs Debian packages.
+fn full(depth: Depth, stage: fn() -> Outcome) -> Outcome {
+    match depth {
+        Depth::Quick => Outcome::Skipped("left out by --quick".into()),
+        Depth::Full => stage(),
+    }
 }
 
 fn summarise(stages: &[Stage]) -> ExitCode {

@@ -1,0 +1,141 @@
+//! What holds the matcher's kernels besides their tests: a memory checker, instruction counts that a
+//! busy machine does not disturb, and the AArch64 build.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use crate::debian;
+use crate::stage::{self, Outcome};
+use crate::workspace;
+
+/// Instructions per pixel that each kernel takes.
+const COUNTS: &str = "matcher/benches/instructions.toml";
+/// A kernel that takes this much more than is kept has become slower.
+const SLACK: f64 = 1.15;
+/// Pixels of the frame that `matcher/examples/instruction_counts.rs` matches.
+const PIXELS: f64 = 256.0 * 192.0;
+
+/// Runs the matcher's unit tests, whose images have odd sizes, under valgrind: the plain kernels and
+/// the AVX2 ones, for valgrind knows no AVX-512.
+pub fn memory_check() -> Outcome {
+    if let Err(why) = debian::ensure(&["valgrind"]) {
+        return Outcome::Skipped(why);
+    }
+    let mut build = workspace::cargo();
+    build.args(["test", "--locked", "-p", "stspp-matcher", "--lib", "--no-run"]);
+    match executable(build, "lib") {
+        Err(why) => Outcome::Failed(why),
+        Ok(binary) => {
+            let mut valgrind = Command::new("valgrind");
+            valgrind.args(["-q", "--error-exitcode=9", "--leak-check=no"]).arg(binary);
+            // One thread, so that an error stands below the name of its test.
+            valgrind.arg("--test-threads=1");
+            stage::command(valgrind)
+        }
+    }
+}
+
+/// Counts the instructions of one small frame per kernel, at the AVX2 level, and compares them with
+/// those kept in the repository.
+pub fn instruction_counts() -> Outcome {
+    if let Err(why) = debian::ensure(&["valgrind"]) {
+        return Outcome::Skipped(why);
+    }
+    let kept = match read_kept() {
+        Ok(kept) => kept,
+        Err(why) => return Outcome::Failed(why),
+    };
+    match count() {
+        Ok(Some(lines)) => compare(&kept, &lines),
+        Ok(None) => Outcome::Skipped("this processor has no AVX2".into()),
+        Err(why) => Outcome::Failed(why),
+    }
+}
+
+fn read_kept() -> Result<BTreeMap<String, f64>, String> {
+    let path = workspace::root().join(COUNTS);
+    let text = std::fs::read_to_string(&path).map_err(|e| format!("{}: {e}", path.display()))?;
+    let table: toml::Table = text.parse().map_err(|e| format!("{}: {e}", path.display()))?;
+    let kept = table.get("per_pixel").and_then(|t| t.as_table()).into_iter().flatten();
+    Ok(kept.filter_map(|(kernel, n)| Some((kernel.clone(), n.as_float()?))).collect())
+}
+
+/// Lines "instructions function" of callgrind; `None` without AVX2.
+fn count() -> Result<Option<Vec<(f64, String)>>, String> {
+    let mut build = workspace::cargo();
+    build.args(["build", "--locked", "-p", "stspp-matcher", "--example", "instruction_counts"]);
+    let binary = executable(build, "example")?;
+    let file = workspace::root().join("target/instruction_counts.callgrind");
+    let mut run = Command::new("valgrind");
+    run.args(["-q", "--tool=callgrind"]);
+    run.arg(format!("--callgrind-out-file={}", file.display())).arg(binary);
+    let said = output(run)?;
+    if !said.starts_with("avx2") {
+        return Ok(None);
+    }
+    let mut annotate = Command::new("callgrind_annotate");
+    annotate.arg("--threshold=100").arg(&file);
+    let text = output(annotate)?;
+    let lines = text.lines().filter_map(|line| {
+        let (number, rest) = line.trim_start().split_once(' ')?;
+        let instructions: f64 = number.replace(',', "").parse().ok()?;
+        Some((instructions, rest.to_owned()))
+    });
+    Ok(Some(lines.collect()))
+}
+
+fn compare(kept: &BTreeMap<String, f64>, lines: &[(f64, String)]) -> Outcome {
+    let mut slower = Vec::new();
+    println!("instructions per pixel, kept and now");
+    for (kernel, kept) in kept {
+        let own = lines.iter().filter(|(_, function)| function.contains(kernel.as_str()));
+        let now = own.map(|(instructions, _)| instructions).sum::<f64>() / PIXELS;
+        println!("  {kernel:<40} {kept:>8.1} {now:>8.1}");
+        if now > SLACK * kept || now < 0.3 * kept {
+            slower.push(format!("{kernel} {kept:.1} -> {now:.1}"));
+        }
+    }
+    if slower.is_empty() {
+        return Outcome::Passed(format!("{} kernels", kept.len()));
+    }
+    Outcome::Failed(format!(
+        "another cost than {COUNTS} keeps (or another name): {}",
+        slower.join(", ")
+    ))
+}
+
+/// Lets a compiler check the NEON kernels, which no x86 build sees.
+pub fn aarch64() -> Outcome {
+    const TARGET: &str = "aarch64-unknown-linux-gnu";
+    let rustc = Path::new("/usr/bin/rustc");
+    if let Err(why) = debian::ensure(&["rustc-web", "rust-web-src"]) {
+        return Outcome::Skipped(why);
+    }
+    let mut check = workspace::cargo();
+    check.env("RUSTC", rustc).env("RUSTC_BOOTSTRAP", "1").env_remove("RUSTFLAGS");
+    check.args(["check", "--locked", "-p", "stspp-matcher", "--target", TARGET]);
+    // The compiler is another one: its own folder keeps both from building everything anew.
+    check.args(["--target-dir", "target/aarch64", "-Z", "build-std=std"]);
+    stage::command(check)
+}
+
+fn output(mut command: Command) -> Result<String, String> {
+    let output = command.stderr(Stdio::inherit()).output();
+    let output = output.map_err(|e| format!("{command:?} could not be run: {e}"))?;
+    if !output.status.success() {
+        return Err(format!("{command:?} ended with {}", output.status));
+    }
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// Builds, and gives the executable of the target of that kind.
+fn executable(mut build: Command, kind: &str) -> Result<PathBuf, String> {
+    build.arg("--message-format=json-render-diagnostics");
+    let text = output(build)?;
+    text.lines()
+        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+        .filter(|m| m["reason"] == "compiler-artifact" && m["target"]["kind"][0] == kind)
+        .find_map(|m| m["executable"].as_str().map(PathBuf::from))
+        .ok_or_else(|| format!("no {kind} was built"))
+}
