@@ -110,6 +110,7 @@ impl OrderChoice {
                             let estimates = (first_px.row(top + row), second_px.row(top + row));
                             let (zncc, out) = (&mut zncc[at.clone()], &mut out[at]);
                             b.finish(level, y - RADIUS, estimates, (sigma, zncc_min), zncc, out);
+                        }
                     }
                 });
             });
