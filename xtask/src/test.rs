@@ -76,8 +76,11 @@ pub fn run(depth: Depth) -> ExitCode {
     summarise(&[stages, deeper].concat())
 }
 
+/// A stage's name and work.
+type Named = (&'static str, fn() -> Outcome);
+
 /// The matcher's kernels beyond their tests.
-const KERNELS: [(&str, fn() -> Outcome); 3] = [
+const KERNELS: [Named; 3] = [
     ("memory check", kernels::memory_check),
     ("instruction counts", kernels::instruction_counts),
     ("NEON kernels", kernels::aarch64),
