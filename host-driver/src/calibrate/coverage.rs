@@ -12,6 +12,27 @@ pub const BANDS_M: [f64; 2] = [1.0, 1.5];
 /// Points below which a part counts as not covered.
 const POINTS_MIN: usize = 3;
 
+/// What had no board.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum GapKind {
+    /// A band of depth.
+    Depth,
+    /// A part of an image, at any depth.
+    Image,
+    /// A corner of an image, in one band of depth.
+    ImageAtDepth,
+}
+
+/// Something that had no board.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Gap {
+    /// What it is.
+    pub kind: GapKind,
+    /// The same in words.
+    pub text: String,
+}
+
 /// Points seen in each part of each image, in each band of depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct Coverage {
@@ -68,19 +89,21 @@ impl Coverage {
             .collect()
     }
 
-    /// What is missing, in sentences: the bands that no board was in, the parts of an image without a
-    /// board, and the corners of an image without one at some depth.
-    pub fn sentences(&self) -> Vec<String> {
-        let mut sentences = Vec::new();
+    /// What is missing: the bands that no board was in, the parts of an image without a board, and the
+    /// corners of an image without one at some depth.
+    pub fn gaps(&self) -> Vec<Gap> {
+        let mut gaps = Vec::new();
         let missing_bands = self.missing_bands();
         for &band in &missing_bands {
-            sentences.push(format!("no board {}", band_name(band)));
+            let text = format!("no board {}", band_name(band));
+            gaps.push(Gap { kind: GapKind::Depth, text });
         }
         for (side, camera) in ["left", "right"].into_iter().enumerate() {
             let parts = self.missing_parts(side);
             if !parts.is_empty() {
                 let names: Vec<_> = parts.iter().map(|&(r, c)| part_name(r, c)).collect();
-                sentences.push(format!("no board in the {} of the {camera} image", joined(&names)));
+                let text = format!("no board in the {} of the {camera} image", joined(&names));
+                gaps.push(Gap { kind: GapKind::Image, text });
             }
             for band in 0..3 {
                 if missing_bands.contains(&band) {
@@ -94,15 +117,16 @@ impl Coverage {
                     .map(|(row, column)| part_name(row, column))
                     .collect();
                 if !names.is_empty() {
-                    sentences.push(format!(
+                    let text = format!(
                         "no board in the {} of the {camera} image {}",
                         joined(&names),
                         band_name(band)
-                    ));
+                    );
+                    gaps.push(Gap { kind: GapKind::ImageAtDepth, text });
                 }
             }
         }
-        sentences
+        gaps
     }
 }
 
@@ -139,24 +163,22 @@ mod tests {
     #[test]
     fn what_is_missing_is_said_in_words() {
         let mut coverage = Coverage { points: [[[[5; 3]; 3]; 3]; 2] };
-        assert!(coverage.sentences().is_empty());
+        let texts = |c: &Coverage| c.gaps().into_iter().map(|gap| gap.text).collect::<Vec<_>>();
+        assert!(texts(&coverage).is_empty());
         coverage.points[0][2][2][0] = 0;
-        assert_eq!(
-            coverage.sentences(),
-            ["no board in the lower left of the left image beyond 1.5 m"]
-        );
+        assert_eq!(texts(&coverage), ["no board in the lower left of the left image beyond 1.5 m"]);
         for band in 0..3 {
             for row in 0..3 {
                 coverage.points[1][band][row][2] = 0;
             }
         }
         assert_eq!(
-            coverage.sentences()[1],
+            texts(&coverage)[1],
             "no board in the upper right, right and lower right of the right image"
         );
         for side in 0..2 {
             coverage.points[side][0] = [[0; 3]; 3];
         }
-        assert_eq!(coverage.sentences()[0], "no board nearer than 1 m");
+        assert_eq!(texts(&coverage)[0], "no board nearer than 1 m");
     }
 }

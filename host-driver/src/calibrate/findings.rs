@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::coverage::Coverage;
+use super::coverage::{Coverage, GapKind};
 use super::detect::{Problem, Quality};
 use super::observations::Observations;
 use super::solve::{Solution, ViewFit, rms};
@@ -89,16 +89,14 @@ pub fn findings(
     if let Some(solution) = solution {
         of_views(observations, solution, &mut found);
         of_result(solution, baseline_m, &mut found);
-        let coverage = Coverage::of(observations, solution);
-        let sides = [0, 1].map(|side| coverage.missing_parts(side).len());
-        for sentence in coverage.sentences() {
-            // A corner that lacks one depth is only mentioned in the report.
-            let kind = match (sentence.contains("image"), sentence.contains(" m")) {
-                (false, _) => Kind::DepthCoverage,
-                (true, false) if sides.iter().sum::<usize>() > 0 => Kind::ImageCoverage,
-                _ => continue,
+        for gap in Coverage::of(observations, solution).gaps() {
+            let kind = match gap.kind {
+                GapKind::Depth => Kind::DepthCoverage,
+                GapKind::Image => Kind::ImageCoverage,
+                // Mentioned in the report only.
+                GapKind::ImageAtDepth => continue,
             };
-            let text = format!("{sentence}: add images with the board there");
+            let text = format!("{}: add images with the board there", gap.text);
             found.push(Finding { kind, text });
         }
     }

@@ -131,7 +131,7 @@ impl Report {
                 .collect(),
             coverage,
             bands_m: BANDS_M,
-            missing: coverage.sentences(),
+            missing: coverage.gaps().into_iter().map(|gap| gap.text).collect(),
             findings: findings(observations, images, Some(solution), baseline_m),
             views,
         }

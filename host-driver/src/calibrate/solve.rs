@@ -67,8 +67,6 @@ pub struct Solution {
     pub adjusted: Adjusted,
     /// View by view; `None` for views with too few points.
     pub views: Vec<Option<ViewFit>>,
-    /// Whether the first estimates of the focal lengths came from the views, or were guessed.
-    pub is_focal_known: bool,
 }
 
 impl Solution {
@@ -186,11 +184,7 @@ pub fn solve(observations: &Observations, loss: Loss) -> Result<Solution, SolveE
             views[view] = fit_left_out(observations, &adjusted, view, *pose);
         }
     }
-    let solution = Solution {
-        adjusted,
-        views,
-        is_focal_known: starts.iter().all(|start| start.is_focal_known),
-    };
+    let solution = Solution { adjusted, views };
     solution.calibration().validate()?;
     Ok(solution)
 }

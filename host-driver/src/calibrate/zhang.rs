@@ -25,8 +25,6 @@ pub struct Start {
     pub camera: CameraIntrinsics,
     /// Pose of the board in this camera's frame, view by view.
     pub camera_from_board: Vec<Option<Isometry3<f64>>>,
-    /// Whether the views determined the focal length.
-    pub is_focal_known: bool,
 }
 
 /// Estimates one camera from its sightings; `side` is 0 for the left camera.
@@ -52,7 +50,7 @@ pub fn estimate(observations: &Observations, side: usize) -> Start {
     };
     let camera_from_board =
         homographies.iter().map(|h| h.as_ref().and_then(|h| pose(h, focal))).collect();
-    Start { camera, camera_from_board, is_focal_known: plausible.is_some() }
+    Start { camera, camera_from_board }
 }
 
 /// Homography from the board's plane (metres) to pixels relative to the image's middle.

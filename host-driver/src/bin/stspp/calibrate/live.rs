@@ -17,12 +17,15 @@ use crate::source::{Source, failure, output_failure};
 
 /// How long nothing may be taken before it is given up.
 const PATIENCE: Duration = Duration::from_secs(120);
+/// The same where nobody brings a board: the simulator's is there, or never.
+const PATIENCE_SIM: Duration = Duration::from_secs(10);
 
 /// What live images take.
 #[derive(clap::Args)]
 pub struct Args {
-    #[command(flatten)]
-    source: Source,
+    /// Where images come from: usb:, usb:SERIAL, serial:PORT, or the simulated sensor with a board.
+    #[arg(long = "source", short = 's', default_value = "sim:calibration", value_name = "URI")]
+    uri: String,
     /// Image pairs to take.
     #[arg(long, short = 'n', default_value_t = 25, value_name = "N")]
     images: usize,
@@ -41,19 +44,17 @@ pub fn collect(
     force: bool,
     output: &Output,
 ) -> Result<(Found, Option<f64>), Failure> {
-    let mut sensor = args.source.open()?;
-    if args.source.timing.is_none() {
-        // Every second slot is dark: the floodlight keeps within its duty.
-        let timing = ProjectionTiming {
-            slots: [Slot::floodlight(), Slot::dark()].into_iter().collect(),
-            exposure_us: args.exposure_us,
-            ..ProjectionTiming::default()
-        };
-        match sensor.set_timing(timing) {
-            // A recording shows what it shows.
-            Ok(()) | Err(Error::Unsupported { .. }) => {}
-            Err(error) => return Err(failure(&error)),
-        }
+    let mut sensor = Source { uri: args.uri.clone(), timing: None }.open()?;
+    // Every second slot is dark: the floodlight keeps within its duty.
+    let timing = ProjectionTiming {
+        slots: [Slot::floodlight(), Slot::dark()].into_iter().collect(),
+        exposure_us: args.exposure_us,
+        ..ProjectionTiming::default()
+    };
+    match sensor.set_timing(timing) {
+        // A recording shows what it shows.
+        Ok(()) | Err(Error::Unsupported { .. }) => {}
+        Err(error) => return Err(failure(&error)),
     }
     let mut folder = match &args.save {
         Some(path) => Some(OutputFolder::create(path, force).map_err(|e| output_failure(&e))?),
@@ -80,6 +81,7 @@ fn stream(
     let mut collector = Collector::new(board);
     let mut last_kept_s: Option<f64> = None;
     let mut last: Option<Offer> = None;
+    let patience = if args.uri.starts_with("sim:") { PATIENCE_SIM } else { PATIENCE };
     while collector.len() < args.images {
         let Some(pair) = pairs.next() else { break };
         let pair = pair.map_err(|e| failure(&e))?;
@@ -102,7 +104,7 @@ fn stream(
                         .map_err(|e| output_failure(&e))?;
                 }
             }
-        } else if since_s > PATIENCE.as_secs_f64() {
+        } else if since_s > patience.as_secs_f64() {
             break;
         }
         progress.set_message(match &offer {
