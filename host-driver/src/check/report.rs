@@ -16,6 +16,12 @@ pub const GOOD_PX: f64 = 0.1;
 /// Epipolar RMS up to which it can be used; beyond, points are lost and depths are off.
 pub const USABLE_PX: f64 = 0.3;
 
+/// Depth error, at 1 m and growing with the square of the depth, that counts as much as these: what 0.1
+/// and 0.3 px along the rows are for the default sensor. A yaw hardly shows across the rows.
+pub const GOOD_MM_AT_1_M: f64 = 0.13;
+/// See [`GOOD_MM_AT_1_M`].
+pub const USABLE_MM_AT_1_M: f64 = 0.4;
+
 /// A calibration's state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -83,11 +89,6 @@ impl Report {
     pub fn new(calibration: &StereoCalibration, checked: &Checked) -> Self {
         let before = vertical(calibration, &checked.after);
         let after = vertical(&checked.corrected, &checked.after);
-        let verdict = match before.rms_px {
-            rms if rms <= GOOD_PX => Verdict::Good,
-            rms if rms <= USABLE_PX => Verdict::Drifted,
-            _ => Verdict::Bad,
-        };
         let median = |value: &dyn Fn(&Match) -> f64| {
             let mut values: Vec<f64> = checked.before.matches.iter().map(value).collect();
             values.retain(|v| v.is_finite());
@@ -96,6 +97,16 @@ impl Report {
         };
         let drift = &checked.drift;
         let is_significant = drift.is_significant();
+        let depth = depth_effect(calibration, &checked.corrected, &checked.after);
+        let costs_mm = if is_significant { depth.rms_mm / depth.depth_m.powi(2) } else { 0.0 };
+        let within = |px: f64, mm: f64| before.rms_px <= px && costs_mm <= mm;
+        let verdict = if within(GOOD_PX, GOOD_MM_AT_1_M) {
+            Verdict::Good
+        } else if within(USABLE_PX, USABLE_MM_AT_1_M) {
+            Verdict::Drifted
+        } else {
+            Verdict::Bad
+        };
         Self {
             verdict,
             windows: [
@@ -109,7 +120,7 @@ impl Report {
             zncc: median(&|m| m.zncc),
             drift: drift.clone(),
             is_significant,
-            depth: depth_effect(calibration, &checked.corrected, &checked.after),
+            depth,
         }
     }
 

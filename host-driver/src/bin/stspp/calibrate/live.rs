@@ -22,6 +22,7 @@ const PATIENCE_SIM: Duration = Duration::from_secs(10);
 
 /// What live images take.
 #[derive(clap::Args)]
+#[group(skip)]
 pub struct Args {
     /// Where images come from: usb:, usb:SERIAL, serial:PORT, or the simulated sensor with a board.
     #[arg(long = "source", short = 's', default_value = "sim:calibration", value_name = "URI")]
