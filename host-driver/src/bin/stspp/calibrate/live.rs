@@ -45,7 +45,7 @@ pub fn collect(
     force: bool,
     output: &Output,
 ) -> Result<(Found, Option<f64>), Failure> {
-    let mut sensor = Source { uri: args.uri.clone(), timing: None }.open()?;
+    let mut sensor = Source::new(args.uri.clone(), None).open()?;
     // Every second slot is dark: the floodlight keeps within its duty.
     let timing = ProjectionTiming {
         slots: [Slot::floodlight(), Slot::dark()].into_iter().collect(),
