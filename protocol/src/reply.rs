@@ -143,11 +143,11 @@ pub enum RequestField {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum StorageError {
-    /// Nothing valid is stored.
+    /// Nothing is stored.
     Empty,
     /// Writing failed; what was stored before is still there.
     Write,
-    /// Reading failed.
+    /// What is stored is damaged, or cannot be read.
     Read,
 }
 
@@ -251,7 +251,7 @@ impl fmt::Display for RequestError {
                 f.write_str("the settings could not be written; the old ones are kept")
             }
             RequestError::Storage(StorageError::Read) => {
-                f.write_str("the settings could not be read")
+                f.write_str("the stored settings are damaged: set the timing and store it anew")
             }
             RequestError::Unsupported => f.write_str("this board cannot do that"),
         }

@@ -43,13 +43,19 @@ struct Record {
 ///
 /// # Errors
 ///
-/// [`StorageError::Empty`] where neither page holds any; [`StorageError::Read`] where neither can be
-/// read.
+/// [`StorageError::Empty`] where both pages are erased; [`StorageError::Read`] where what they hold is
+/// damaged, or neither can be read.
 pub fn load<S: SettingsStore>(store: &S) -> Result<Settings, StorageError> {
     match newest(store)? {
         Some((_, record)) => Ok(record.settings),
-        None => Err(StorageError::Empty),
+        None if is_erased(store, Page::A) && is_erased(store, Page::B) => Err(StorageError::Empty),
+        None => Err(StorageError::Read),
     }
+}
+
+fn is_erased<S: SettingsStore>(store: &S, page: Page) -> bool {
+    let mut bytes = [0; RECORD_LEN];
+    store.read(page, &mut bytes).is_ok() && bytes.iter().all(|byte| *byte == 0xFF)
 }
 
 /// Stores settings; on failure the ones stored before are still there.

@@ -120,6 +120,9 @@ fn corrupt_settings(variant: Variant) {
     power_cycle(&mut session);
     assert_eq!(active(&mut session), ProjectionTiming::default());
     session.hello().unwrap();
+    let refused = session.call(Request::LoadSettings(LoadSettings)).unwrap_err();
+    assert_eq!(refused, CallError::Refused(RequestError::Storage(StorageError::Read)));
+    println!("{variant:?}: {refused}");
     // And they can be written again.
     save(&mut session, 12_000);
     power_cycle(&mut session);
