@@ -1,5 +1,5 @@
-//! Clean-up of the coarse disparities before the refinement: a small median, and removal of small
-//! regions. (The left-right check and uniqueness are part of the search, which has the costs.)
+//! Clean-up of the coarse disparities before the refinement: a small median. (The left-right check and
+//! uniqueness are part of the search, which has the costs; [`crate::regions`] removes small regions.)
 
 use rayon::prelude::*;
 
@@ -46,50 +46,6 @@ pub fn median_3x3(map: &Image<f32>, out: &mut Image<f32>) {
     });
 }
 
-/// Removes connected regions of fewer than `least` pixels. Pixels are connected to those of their
-/// four neighbours that are within [`STEP_PX`].
-///
-/// Wrong matches that pass the other checks come singly or in small clumps, as there is no reason for
-/// them to agree; surfaces are large.
-pub fn remove_small_regions(map: &mut Image<f32>, least: usize) {
-    let (width, height) = (map.width(), map.height());
-    let values = map.as_mut_slice();
-    // Union-find over the pixels, parents always at lower or equal index.
-    let mut parent: Vec<u32> = (0..values.len() as u32).collect();
-    let mut joined = |a: usize, b: usize| {
-        let (a, b) = (root(&mut parent, a as u32), root(&mut parent, b as u32));
-        parent[a.max(b) as usize] = a.min(b);
-    };
-    for y in 0..height {
-        for x in 0..width {
-            let i = y * width + x;
-            if x + 1 < width && (values[i] - values[i + 1]).abs() <= STEP_PX {
-                joined(i, i + 1);
-            }
-            if y + 1 < height && (values[i] - values[i + width]).abs() <= STEP_PX {
-                joined(i, i + width);
-            }
-        }
-    }
-    let mut size = vec![0u32; values.len()];
-    for i in 0..values.len() {
-        size[root(&mut parent, i as u32) as usize] += 1;
-    }
-    for i in 0..values.len() {
-        if (size[root(&mut parent, i as u32) as usize] as usize) < least {
-            values[i] = f32::NAN;
-        }
-    }
-}
-
-fn root(parent: &mut [u32], mut at: u32) -> u32 {
-    while parent[at as usize] != at {
-        parent[at as usize] = parent[parent[at as usize] as usize];
-        at = parent[at as usize];
-    }
-    at
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -113,25 +69,5 @@ mod tests {
             }
         }
         assert_eq!(out.row(5), truth.row(5));
-    }
-
-    #[test]
-    fn small_regions_go_and_large_ones_stay() {
-        let mut map = Image::new(20, 10, f32::NAN);
-        for y in 0..10 {
-            (0..12).for_each(|x| map.set(x, y, 5.0));
-        }
-        for x in 14..18 {
-            map.set(x, 4, 9.0);
-            map.set(x, 5, 9.5);
-        }
-        map.set(3, 3, 50.0);
-        let mut cleaned = map.clone();
-        remove_small_regions(&mut cleaned, 9);
-        assert!(cleaned.row(4)[15].is_nan() && cleaned.row(3)[3].is_nan());
-        assert_eq!(cleaned.row(9)[11], 5.0);
-        let mut kept = map.clone();
-        remove_small_regions(&mut kept, 8);
-        assert_eq!(kept.row(4)[15], 9.0);
     }
 }

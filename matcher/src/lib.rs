@@ -2,7 +2,8 @@
 //!
 //! Data flow: a [`StereoStack`] of N rectified pairs goes through census, Hamming cost, winner takes
 //! all, parabola, reliability retry, left-right check, sub-pixel refinement by Stereo-DIC, growth into
-//! the gaps, the verdict on pixels at depth steps, and comes out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
+//! the gaps, a try with single rows where surfaces are steep, the verdict on pixels at depth steps, and
+//! comes out as a [`Matched`] disparity and ZNCC map. Each stage is a file.
 
 mod aligned;
 pub mod bspline;
@@ -27,6 +28,7 @@ pub mod regions;
 pub mod retry;
 pub mod search;
 pub mod stack;
+pub mod steep;
 pub mod step;
 pub mod synthetic;
 pub mod wta;

@@ -10,6 +10,7 @@ use crate::{
     fast::Fast,
     icgn::{field::Field, guess::CoarseMap, prepare::Prepared},
     parallel::Pool,
+    regions::Regions,
     search::{self, Coarse},
 };
 
@@ -31,6 +32,7 @@ pub struct Matcher {
     prepared: Prepared,
     map: CoarseMap,
     field: Field,
+    regions: Regions,
     order: OrderChoice,
     /// Made by the first frame that needs it.
     fast: Option<Fast>,
@@ -54,6 +56,7 @@ impl Matcher {
             prepared: Prepared::default(),
             map: CoarseMap::default(),
             field: Field::default(),
+            regions: Regions::default(),
             order: OrderChoice::default(),
             fast: None,
         })
@@ -114,7 +117,7 @@ impl Matcher {
             let pixels = coarse.disparity_px.as_mut_slice().iter_mut().zip(mask.as_slice());
             pixels.filter(|(_, m)| **m == 0).for_each(|(d, _)| *d = f32::NAN);
         }
-        check::remove_small_regions(&mut coarse.disparity_px, self.params.advanced.region_min);
+        self.regions.remove(&mut coarse.disparity_px, self.params.advanced.region_min);
         clock.stage("check");
         coarse
     }
@@ -149,7 +152,7 @@ impl Matcher {
         self.prepared.fill(stack, self.params.advanced.interpolation);
         self.map.fill(&coarse.disparity_px);
         clock.stage("prepare");
-        let Self { field, prepared, map, order, params, level, .. } = self;
+        let Self { field, prepared, map, order, params, level, regions, .. } = self;
         field.refine(prepared, map, stack, params, *level);
         clock.stage("icgn");
         let (mut disparity_px, mut zncc) = (field.disparity_px(), field.zncc());
@@ -160,7 +163,7 @@ impl Matcher {
             zncc = maps.zncc;
             clock.stage("order");
         }
-        check::remove_small_regions(&mut disparity_px, params.advanced.region_min);
+        regions.remove(&mut disparity_px, params.advanced.region_min);
         for (z, d) in zncc.as_mut_slice().iter_mut().zip(disparity_px.as_slice()) {
             *z = if d.is_nan() { f32::NAN } else { *z };
         }

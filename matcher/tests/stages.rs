@@ -16,6 +16,7 @@ use stspp_matcher::{
         shape::Shape,
         window::Window,
     },
+    regions::Regions,
     search,
 };
 use synthetic::{Layer, Random, Rendered, Scene};
@@ -208,8 +209,8 @@ fn checks_follow_their_definitions() {
     assert!(same(&out, &check::median_3x3(&map, 1.0)));
     for least in [1, 2, 5, 30, 1000] {
         let mut out = image.clone();
-        fast_check::remove_small_regions(&mut out, least);
-        assert!(same(&out, &check::remove_small_regions(&map, least, 1.0)), "{least}");
+        Regions::default().remove(&mut out, least);
+        assert!(same(&out, &check::remove_small_regions(&map, least)), "{least}");
     }
 }
 

@@ -9,6 +9,8 @@ use rayon::prelude::*;
 use super::{Refined, Refiner, guess::CoarseMap, prepare::Prepared, shape::Shape, window::Window};
 use crate::{
     Image, Level, Params, ShapeFunction, StereoStack,
+    regions::Regions,
+    steep,
     step::{StepJudge, Verdict},
 };
 
@@ -80,13 +82,45 @@ impl Field {
         let second = params.shape != ShapeFunction::First;
         let refiner = Refiner::new(prepared, params, second, level);
         self.refine_matched(&refiner, map);
+        self.write_to(map);
+        self.grow(&refiner, map, stack.left_mask);
+        self.fill_steep(&refiner, map, stack, params);
+        self.settle_steps(&refiner, map, stack, level);
+    }
+
+    /// Looks for surfaces in the gaps that were too steep for the coarse search's square windows, and
+    /// grows from them.
+    fn fill_steep(
+        &mut self,
+        refiner: &Refiner<'_>,
+        map: &mut CoarseMap,
+        stack: &StereoStack<'_>,
+        params: &Params,
+    ) {
+        let mut filled_px = self.disparity_px();
+        steep::fill(stack, params.disparity, &mut filled_px);
+        Regions::default().remove(&mut filled_px, params.advanced.region_min);
+        let mut any = false;
+        for (i, &d) in filled_px.as_slice().iter().enumerate() {
+            if self.points[i].is_none() && !d.is_nan() {
+                map.set(i % self.width, i / self.width, d);
+                any = true;
+            }
+        }
+        if any {
+            self.refine_matched(refiner, map);
+            self.write_to(map);
+            self.grow(refiner, map, stack.left_mask);
+        }
+    }
+
+    /// Writes the points' disparities to a map.
+    fn write_to(&self, map: &mut CoarseMap) {
         for (y, row) in self.points.chunks_exact(self.width).enumerate() {
             for (x, point) in row.iter().enumerate() {
                 map.set(x, y, -point.shape[0]);
             }
         }
-        self.grow(&refiner, map, stack.left_mask);
-        self.settle_steps(&refiner, map, stack, level);
     }
 
     /// Lets the pixels' own grey values decide at depth steps, and fits the subsets there once more,
@@ -201,6 +235,7 @@ impl Field {
         Image::from_vec(self.width, self.height, values).expect("a point for every pixel")
     }
 
+    /// Refines all points that `map` has a disparity for and that are not refined yet.
     fn refine_matched(&mut self, refiner: &Refiner<'_>, map: &CoarseMap) {
         let width = self.width;
         self.points.par_chunks_mut(width * BAND).enumerate().for_each_init(
@@ -211,7 +246,7 @@ impl Field {
                         let y = band * BAND + row;
                         let last = (first + TILE).min(width);
                         for (x, point) in (first..last).zip(&mut points[first..last]) {
-                            if map.at(x, y).is_nan() {
+                            if map.at(x, y).is_nan() || !point.is_none() {
                                 continue;
                             }
                             if let Some(refined) = refiner.point(map, x, y, part) {

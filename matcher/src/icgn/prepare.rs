@@ -120,10 +120,11 @@ impl Prepared {
         self.width + 2 * MARGIN
     }
 
-    /// Whether the right camera saw position `at` of row `y`: to half a pixel beyond its last one.
+    /// Whether the right camera saw position `at` of row `y`, its border pixels' outer halves included:
+    /// one of the two pixels beside it is inside.
     pub(crate) fn right_sees(&self, y: usize, at: f64) -> bool {
-        let column = (at + 0.5).floor() as i64;
-        self.right_is_inside(y, column, column)
+        let column = at.floor() as i64;
+        self.right_is_inside(y, column, column) || self.right_is_inside(y, column + 1, column + 1)
     }
 
     /// Whether the right columns `first..=last` of row `y` are all inside the image and its mask.

@@ -1,6 +1,6 @@
 //! The surfaces that a pixel could show.
 
-use super::JUMP_PX;
+use super::{ALONG_PX, JUMP_PX, STEEP};
 use crate::Image;
 
 /// How far another surface is looked for: beyond the width of fattening, and one more.
@@ -16,6 +16,8 @@ pub(crate) struct Candidate {
     pub disparity_px: f32,
     /// Its change per column and row.
     pub slope: [f32; 2],
+    /// Way from the pixel to the next one that is on the surface, farther from the step.
+    pub inwards: (i32, i32),
 }
 
 impl Candidate {
@@ -52,7 +54,7 @@ impl Candidates {
                 }
                 let plane = plane(map, px, py, value);
                 let continued = plane.at(-dx, -dy);
-                let candidate = Candidate { disparity_px: continued, ..plane };
+                let candidate = Candidate { disparity_px: continued, inwards: (dx, dy), ..plane };
                 let known = candidates.iter().any(|c| (c.disparity_px - continued).abs() < SAME_PX);
                 let same = (continued - own.disparity_px).abs() < SAME_PX;
                 if !known && !same {
@@ -85,5 +87,34 @@ pub(crate) fn plane(map: &Image<f32>, x: usize, y: usize, value: f32) -> Candida
             (None, None) => 0.0,
         }
     };
-    Candidate { disparity_px: value, slope: [slope(1, 0), slope(0, 1)] }
+    Candidate { disparity_px: value, slope: [slope(1, 0), slope(0, 1)], inwards: (0, 0) }
+}
+
+/// The surface that the map gives pixel (x, y), which is a number there. Inwards is where most of the
+/// pixels around on the same surface are, in one of eight directions; nowhere when they are all around.
+pub(crate) fn own(map: &Image<f32>, x: usize, y: usize) -> Candidate {
+    let plane = plane(map, x, y, map.row(y)[x]);
+    let (mut sx, mut sy) = (0i32, 0i32);
+    for dy in -2..=2i32 {
+        for dx in -2..=2i32 {
+            let at = (x.checked_add_signed(dx as isize), y.checked_add_signed(dy as isize));
+            let (Some(px), Some(py)) = at else { continue };
+            let Some(value) = map.get(px, py) else { continue };
+            let limit = ALONG_PX + STEEP * dx.abs().max(dy.abs()) as f32;
+            if (value - plane.disparity_px).abs() < limit {
+                (sx, sy) = (sx + dx, sy + dy);
+            }
+        }
+    }
+    // Within 22.5 degrees of an axis the direction is that axis: tan 22.5 = 0.414.
+    let inwards = if sx * sx + sy * sy <= 2 {
+        (0, 0)
+    } else if 1000 * sy.abs() <= 414 * sx.abs() {
+        (sx.signum(), 0)
+    } else if 1000 * sx.abs() <= 414 * sy.abs() {
+        (0, sy.signum())
+    } else {
+        (sx.signum(), sy.signum())
+    };
+    Candidate { inwards, ..plane }
 }

@@ -11,7 +11,7 @@
 //! patterns, so two statistics depend on f alone:
 //!
 //! ```text
-//! light        cov(L, R_k) / (the same inside the surface)   = f^2
+//! light        cov(L, R_k) / (the same inside the surface)    = f^2
 //! similarity   cov(L, R_k) / sqrt(var L var R_k)              = f^2 / (f^2 + (1 - f)^2)
 //! ```
 //!
@@ -26,21 +26,26 @@ use rayon::prelude::*;
 
 use crate::{Image, Level, StereoStack, lanes::vectorised};
 use decide::Judge;
-pub use decide::{FRAMES_MIN, LIGHT_MIN, SIMILARITY_MIN};
+pub use decide::{FRAMES_MIN, LIGHT_MIN, NEXT_LIGHT_MIN, SIMILARITY_MIN};
 use signature::{Signature, signature};
 
 /// Disparities of neighbours that differ by more belong to different surfaces.
 pub const JUMP_PX: f32 = 1.5;
 
-/// How deep a surface is peeled: fattening is up to two pixels wide, and blur adds one.
-pub const PASSES: usize = 3;
+/// Pixels of one surface in the row along a step differ by less, and by [`STEEP`] more for every pixel
+/// between them.
+const ALONG_PX: f32 = 2.5;
+const STEEP: f32 = 0.75;
+
+/// How deep a surface is peeled: fattening is up to two pixels wide.
+pub const PASSES: usize = 2;
 
 /// How far from a step pixels may be of use: the light inside surfaces is taken there, and windows of
 /// the usual size reach the step.
 pub const NEAR_RADIUS: usize = INSIDE_RADIUS + 1;
 
 /// Gaps up to this wide with the same surface on both sides are dark spots.
-const BRIDGE_PX: usize = 4;
+const BRIDGE_PX: usize = 8;
 
 /// Radius of the window that the light inside a surface is averaged over.
 const INSIDE_RADIUS: usize = 4;

@@ -35,8 +35,10 @@ pub fn median_3x3(map: &[Vec<f64>], step: f64) -> Vec<Vec<f64>> {
     out
 }
 
-/// Removes regions, found by flooding from each pixel in turn.
-pub fn remove_small_regions(map: &[Vec<f64>], least: usize, step: f64) -> Vec<Vec<f64>> {
+/// Removes regions, found by flooding from each pixel in turn. Neighbours a, b belong together when they
+/// differ by at most 1.5, or by at most 4 and no more than 1 differently than b and the pixel beyond it,
+/// or than a and the pixel before it.
+pub fn remove_small_regions(map: &[Vec<f64>], least: usize) -> Vec<Vec<f64>> {
     let (h, w) = (map.len() as i64, map[0].len() as i64);
     let mut out = map.to_vec();
     for y in 0..h {
@@ -48,8 +50,17 @@ pub fn remove_small_regions(map: &[Vec<f64>], least: usize, step: f64) -> Vec<Ve
                     if nx < 0 || ny < 0 || nx >= w || ny >= h || seen.contains(&(nx, ny)) {
                         continue;
                     }
-                    let here = map[py as usize][px as usize];
-                    if (map[ny as usize][nx as usize] - here).abs() <= step {
+                    let value = |x: i64, y: i64| {
+                        let inside = x >= 0 && y >= 0 && x < w && y < h;
+                        if inside { map[y as usize][x as usize] } else { f64::NAN }
+                    };
+                    let (dx, dy) = (nx - px, ny - py);
+                    let across = value(nx, ny) - value(px, py);
+                    let before = value(px, py) - value(px - dx, py - dy);
+                    let after = value(nx + dx, ny + dy) - value(nx, ny);
+                    let slope_goes_on =
+                        (across - before).abs() <= 1.0 || (across - after).abs() <= 1.0;
+                    if across.abs() <= 1.5 || (across.abs() <= 4.0 && slope_goes_on) {
                         seen.insert((nx, ny));
                         open.push((nx, ny));
                     }
