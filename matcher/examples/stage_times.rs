@@ -5,7 +5,7 @@
 use stspp_matcher::{
     DisparityRange, Image, Level, ShapeFunction,
     coarse::{Coarse, CoarseMap, INVALID},
-    dense::{DenseFit, DenseMaps, mark_steps, order::OrderChoice},
+    dense::{DenseFit, DenseMaps, mark_steps, motion::MotionFit, order::OrderChoice},
     regions::Regions,
     synthetic::Scene,
 };
@@ -35,9 +35,18 @@ fn main() {
     let mut order = OrderChoice::default();
     let mut regions = Regions::default();
     let mut disparity = Image::new(w, h, f32::NAN);
-    let names =
-        ["describe", "search", "start and steps", "dense first", "dense", "order", "regions"];
-    let mut best = [f64::INFINITY; 7];
+    let mut motion = MotionFit::new(level);
+    let names = [
+        "describe",
+        "search",
+        "start and steps",
+        "dense first",
+        "dense",
+        "order",
+        "regions",
+        "motion at rest",
+    ];
+    let mut best = [f64::INFINITY; 8];
     r.with_stack(|s| {
         for _ in 0..repeats {
             let mut t = cpu_ms();
@@ -59,6 +68,9 @@ fn main() {
             lap(3);
             auto.fit(s, &start, &step, &mut maps);
             lap(4);
+            let moved = motion.run(s, &mut auto, &start, &step, &mut maps);
+            lap(7);
+            assert!(moved.is_none(), "the scene is at rest");
             order.choose(level, 0.8, &mut maps, &mut disparity);
             lap(5);
             regions.remove(&mut disparity, 60);
@@ -71,6 +83,6 @@ fn main() {
         println!("  {name:16} {ms:6.2}");
     }
     let sum = |with: &[usize]| with.iter().map(|&i| best[i]).sum::<f64>();
-    println!("  frame, first     {:6.2}", sum(&[0, 1, 2, 3, 6]));
-    println!("  frame, auto      {:6.2}", sum(&[0, 1, 2, 4, 5, 6]));
+    println!("  frame, first     {:6.2}", sum(&[0, 1, 2, 3, 6, 7]));
+    println!("  frame, auto      {:6.2}", sum(&[0, 1, 2, 4, 5, 6, 7]));
 }

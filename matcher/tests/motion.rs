@@ -3,7 +3,7 @@
 
 use nalgebra::{SMatrix, SVector};
 use stspp_matcher::{
-    DisparityRange, Image, Matched, Matcher, Method, Params, ShapeFunction, StereoStack,
+    DisparityRange, Image, Level, Matched, Matcher, Method, Params, ShapeFunction, StereoStack,
     synthetic::{Layer, Rendered, Scene},
 };
 
@@ -254,5 +254,28 @@ fn times_may_be_uneven_or_missing_and_frames_few() {
     for frames in [1, 2] {
         let stack = StereoStack::new(&left[..frames], &right[..frames]);
         assert!(matcher.match_stack(&stack).unwrap().at_newest);
+    }
+}
+
+#[test]
+fn neither_threads_nor_the_level_change_a_moving_result() {
+    let scene = plane(RATE_PX).render();
+    let with = |threads: usize, level: Level| {
+        let mut params = params(ShapeFunction::Auto);
+        params.advanced.threads = Some(threads);
+        params.advanced.level_max = Some(level);
+        run(&scene, params)
+    };
+    let bits = |m: &Image<f32>| m.as_slice().iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+    let one = with(1, Level::best());
+    let three = with(3, Level::best());
+    assert_eq!(bits(&one.disparity_px), bits(&three.disparity_px));
+    let rates = |m: &Matched| bits(m.rate_px_per_s.as_ref().unwrap());
+    assert_eq!(rates(&one), rates(&three));
+    for level in Level::available() {
+        let other = with(2, level);
+        let (bias, scatter, _) =
+            errors(&other.disparity_px, |x, y| f64::from(one.disparity_px.row(y)[x]), everywhere);
+        assert!(bias.abs() < 1e-4 && scatter < 1e-3, "{level}: {bias} {scatter}");
     }
 }
