@@ -54,7 +54,9 @@ pub use recording::Recording;
 pub use rectify::{DepthRange, Rectifier};
 
 pub use error::Error;
-pub use pipeline::{DepthStream, LabelledPair, PairStream, StreamOptions, StreamStats};
+pub use pipeline::{
+    BudgetPolicy, DepthStream, LabelledPair, PairStream, StreamOptions, StreamStats,
+};
 pub use sensor::{Sensor, SensorInfo};
 pub use stspp_protocol::timing::{ProjectionTiming, Slot};
 pub use stspp_protocol::trigger::{ExternalTrigger, TriggerEdge, TriggerInput, TriggerSource};

@@ -47,6 +47,11 @@ impl Fast {
         }
     }
 
+    pub(crate) fn set_shape(&mut self, shape: ShapeFunction) {
+        self.params.shape = shape;
+        self.fit.set_shape(shape);
+    }
+
     /// Fills the maps of `out` from a checked stack; the rate is in px per second, or per frame where
     /// the stack has no times. `done` is told the name of each stage at its end.
     pub(crate) fn run(

@@ -67,6 +67,14 @@ impl Matcher {
         &self.params
     }
 
+    /// Changes the order of the shape function, from the next match on.
+    pub fn set_shape(&mut self, shape: ShapeFunction) {
+        self.params.shape = shape;
+        if let Some(fast) = &mut self.fast {
+            fast.set_shape(shape);
+        }
+    }
+
     /// The SIMD level in use.
     pub fn level(&self) -> Level {
         self.level

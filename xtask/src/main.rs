@@ -6,6 +6,7 @@ mod e2e;
 mod firmware;
 mod kernels;
 mod licences;
+mod peers;
 mod stage;
 mod test;
 mod workspace;
@@ -26,6 +27,7 @@ cargo xtask kernels          checks the matcher's kernels under valgrind, compar
                              counts, and lets a compiler check the NEON ones
 cargo xtask e2e [NAME]       plugs the simulated sensor into a Debian kernel in QEMU and tries the
                              stspp binary there: all scenarios, or those with NAME in their name
+cargo xtask peers            OpenCV's StereoSGBM (by pip, into target/peers) beside our matchers
 cargo xtask help             this text";
 
 fn main() -> ExitCode {
@@ -37,6 +39,7 @@ fn main() -> ExitCode {
         ["e2e"] => e2e::run(None),
         ["e2e", only] => e2e::run(Some(only)),
         ["kernels"] => return test::kernels(),
+        ["peers"] => peers::table(&workspace::root()),
         ["arrows"] => workspace::metadata().and_then(|m| arrows::check(&m)),
         ["licences"] => workspace::metadata().and_then(|m| licences::check(&m)),
         ["firmware", rest @ ..] => firmware::run(rest),

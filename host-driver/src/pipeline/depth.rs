@@ -4,8 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crossbeam_channel::{Receiver, SendTimeoutError, Sender};
-use stspp_matcher::{Image, Matcher, Params, Sample, StereoStack};
+use stspp_matcher::{Image, Matcher, Params, Sample, ShapeFunction, StereoStack};
 
+use super::budget::Budget;
 use super::stats::{Mark, Progress};
 use super::stream::StopHandle;
 use super::{LabelledPair, PAIR_QUEUE};
@@ -45,6 +46,8 @@ pub struct MatchInfo {
 pub(crate) struct Cycle {
     pub slots: Vec<SlotLight>,
     pub used: Vec<bool>,
+    /// Time between two windows; zero where it is not known.
+    pub period: Duration,
 }
 
 impl Cycle {
@@ -56,7 +59,8 @@ impl Cycle {
             .map(|s| SlotLight { projector_mask: s.projector_mask, floodlight: s.floodlight })
             .collect();
         let used = slots.iter().map(|slot| slot.is_speckle()).collect();
-        Self { slots, used }
+        let period = Duration::from_micros(u64::from(timing.frame_period_us));
+        Self { slots, used, period }
     }
 }
 
@@ -72,6 +76,8 @@ pub(crate) struct DepthEngine {
     spare: Vec<Rectified>,
     sequence: u64,
     with_labels: bool,
+    /// Order of the shape function at full quality.
+    shape: ShapeFunction,
 }
 
 impl DepthEngine {
@@ -95,6 +101,7 @@ impl DepthEngine {
             spare: Vec::new(),
             sequence: 0,
             with_labels: true,
+            shape: options.shape,
         })
     }
 
@@ -155,6 +162,11 @@ impl DepthEngine {
         Ok(self.window.push(label, rectified))
     }
 
+    /// Goes over to the first-order shape function, or back.
+    pub fn set_reduced(&mut self, reduced: bool) {
+        self.matcher.set_shape(if reduced { ShapeFunction::First } else { self.shape });
+    }
+
     /// Matches the complete window.
     pub fn match_window(&mut self) -> Result<DepthFrame, Error> {
         let labels: Vec<SlotLabel> = self.window.pairs().map(|(label, _)| *label).collect();
@@ -205,6 +217,8 @@ pub(crate) struct MatchThread {
     pub live: bool,
     /// Windows skipped since the last match.
     pub skipped_in_row: usize,
+    /// What gives when the machine is too slow.
+    pub budget: Budget,
 }
 
 impl MatchThread {
@@ -228,7 +242,10 @@ impl MatchThread {
     fn take(&mut self, pair: &LabelledPair) -> bool {
         if self.engine.generation() != Some(pair.timing_generation) {
             match (self.cycles)(pair.timing_generation) {
-                Some(cycle) => self.engine.set_cycle(pair.timing_generation, cycle),
+                Some(cycle) => {
+                    self.budget.set_period(cycle.period);
+                    self.engine.set_cycle(pair.timing_generation, cycle);
+                }
                 None => {
                     self.progress.count(|s| s.pairs_mislabelled += 1);
                     return true;
@@ -257,8 +274,23 @@ impl MatchThread {
             self.progress.count(|s| s.skipped_windows += 1);
             return true;
         }
+        if !self.lossless && !self.budget.admit() {
+            self.progress.count(|s| s.skipped_windows += 1);
+            return true;
+        }
         self.skipped_in_row = 0;
+        let reduced = !self.lossless && self.budget.is_reduced();
+        self.engine.set_reduced(reduced);
+        let begun = std::time::Instant::now();
         let frame = self.engine.match_window();
+        let took = begun.elapsed();
+        self.budget.record(took);
+        self.progress.count(|s| {
+            s.match_ms = took.as_secs_f64() * 1e3;
+            s.over_budget += u64::from(self.budget.is_over(took));
+            s.reduced_frames += u64::from(reduced);
+            s.match_every = if self.lossless { 1 } else { self.budget.every() };
+        });
         self.progress.mark(Mark::Window, self.clock.now_ns());
         match frame {
             Ok(mut frame) => {

@@ -13,6 +13,7 @@
 //! - [`replay`] reads pairs of a recording instead of these two;
 //! - [`depth`] rectifies the newest pair, keeps the window, matches;
 //! - [`stream`] starts and ends the threads and hands out results;
+//! - [`budget`] decides what gives when the machine is too slow;
 //! - [`stats`] counts.
 //!
 //! With hardware a thread never waits for the next one: what finds its queue full is dropped, counted
@@ -21,6 +22,7 @@
 //!
 //! Whatever ends a stream (drop, error, panic), its capture thread stops the device and disarms it.
 
+pub mod budget;
 pub mod capture;
 pub mod depth;
 pub mod pair;
@@ -34,6 +36,7 @@ use crate::reconstruct::Options as MatchOptions;
 use crate::sync::FrameStamp;
 use crate::{RawImage, SlotLabel};
 
+pub use budget::BudgetPolicy;
 pub use depth::MatchInfo;
 pub use stats::StreamStats;
 pub use stream::{DepthStream, PairStream, StopHandle};
@@ -59,11 +62,18 @@ pub struct StreamOptions {
     /// Without a complete window for this long, on the source's clock, the stream yields a
     /// [`crate::error::Timeout`] that names what is missing.
     pub timeout: Duration,
+    /// What gives when matching takes longer than the camera's period. Of no effect where the source
+    /// waits for the matcher (`sim:`, `replay:`).
+    pub budget: BudgetPolicy,
 }
 
 impl Default for StreamOptions {
     fn default() -> Self {
-        Self { matching: MatchOptions::default(), timeout: Duration::from_secs(3) }
+        Self {
+            matching: MatchOptions::default(),
+            timeout: Duration::from_secs(3),
+            budget: BudgetPolicy::default(),
+        }
     }
 }
 

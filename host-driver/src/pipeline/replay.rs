@@ -97,5 +97,6 @@ pub(crate) fn cycle(recording: &Recording, first: usize) -> Cycle {
         .iter()
         .map(|slot| slot.is_some_and(|s| !(s.floodlight && s.projector_mask == 0)))
         .collect();
-    Cycle { slots: slots.into_iter().map(|slot| slot.unwrap_or(dark)).collect(), used }
+    let slots = slots.into_iter().map(|slot| slot.unwrap_or(dark)).collect();
+    Cycle { slots, used, period: Duration::ZERO }
 }

@@ -96,6 +96,14 @@ pub struct StreamStats {
     pub dropped_pairs: u64,
     /// Complete windows skipped for a newer one because matching was too slow.
     pub skipped_windows: u64,
+    /// Every how manyth window is matched: 1 on a machine that keeps up with the camera.
+    pub match_every: u32,
+    /// Matches that took longer than a window's time.
+    pub over_budget: u64,
+    /// Depth frames made with the first-order shape function for want of time.
+    pub reduced_frames: u64,
+    /// Wall time of the newest match in milliseconds.
+    pub match_ms: f64,
     /// Depth frames dropped because the user did not fetch them.
     pub dropped_depth: u64,
     /// Depth frames per second of wall time, over the last ones.

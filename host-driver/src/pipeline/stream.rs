@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use crossbeam_channel::{Receiver, RecvTimeoutError, bounded};
 
+use super::budget::Budget;
 use super::capture::{self, Capture};
 use super::depth::{Cycle, Cycles, DepthEngine, MatchInfo, MatchThread};
 use super::pair::PairThread;
@@ -358,6 +359,7 @@ pub(crate) fn depth(source: PairSource, options: &StreamOptions) -> Result<Depth
         lossless,
         live,
         skipped_in_row: 0,
+        budget: Budget::new(options.budget),
     };
     threads.spawn("match", move || matching.run())?;
     Ok(DepthStream { results, threads, info })

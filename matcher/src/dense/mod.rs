@@ -80,6 +80,11 @@ impl DenseFit {
         }
     }
 
+    /// Changes the order of the shape function.
+    pub(crate) fn set_shape(&mut self, shape: ShapeFunction) {
+        self.shape = shape;
+    }
+
     /// Fits the disparity around `start` (NaN is invalid), whose depth steps are marked in `step`
     /// (see [`mark_steps`]). Sizes must be those of the checked stack; `out` is resized.
     pub fn fit(

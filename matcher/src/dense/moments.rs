@@ -47,6 +47,54 @@ pub(crate) fn slide_sum(
     );
 }
 
+/// The first half of [`slide_sum`]: `column` += `enters` - `leaves`.
+pub(crate) fn slide_columns(
+    level: Level,
+    (enters, leaves): (&[f32], &[f32]),
+    len: usize,
+    column: &mut [f32],
+) {
+    let padded = len + 2 * PAD;
+    assert!(len.is_multiple_of(WIDEST) && column.len() >= padded);
+    assert!(enters.len() >= padded && leaves.len() >= padded);
+    dispatch!(
+        level,
+        columns_lanes(
+            enters: &[f32] = enters,
+            leaves: &[f32] = leaves,
+            len: usize = len,
+            column: &mut [f32] = column,
+        )
+    );
+}
+
+/// The second half: sums 2 `radius` + 1 columns per pixel.
+pub(crate) fn across_sum(level: Level, column: &[f32], radius: usize, len: usize, out: &mut [f32]) {
+    let padded = len + 2 * PAD;
+    assert!(radius <= PAD && len.is_multiple_of(WIDEST));
+    assert!(column.len() >= padded && out.len() >= padded);
+    dispatch!(
+        level,
+        across(
+            radius: usize = radius,
+            len: usize = len,
+            column: &[f32] = column,
+            out: &mut [f32] = out,
+        )
+    );
+}
+
+#[inline(always)]
+fn columns_lanes<V: Lanes>(enters: &[f32], leaves: &[f32], len: usize, column: &mut [f32]) {
+    for i in (PAD..PAD + len).step_by(V::COUNT) {
+        // SAFETY: `i + COUNT <= PAD + len`, as `len` is a multiple of COUNT.
+        unsafe {
+            let change = V::load(enters.as_ptr().add(i)).sub(V::load(leaves.as_ptr().add(i)));
+            V::load(column.as_ptr().add(i)).add(change).store(column.as_mut_ptr().add(i));
+        }
+    }
+}
+
 #[inline(always)]
 fn slide_lanes<V: Lanes>(
     enters: &[f32],
@@ -56,13 +104,7 @@ fn slide_lanes<V: Lanes>(
     column: &mut [f32],
     out: &mut [f32],
 ) {
-    for i in (PAD..PAD + len).step_by(V::COUNT) {
-        // SAFETY: `i + COUNT <= PAD + len`, as `len` is a multiple of COUNT.
-        unsafe {
-            let change = V::load(enters.as_ptr().add(i)).sub(V::load(leaves.as_ptr().add(i)));
-            V::load(column.as_ptr().add(i)).add(change).store(column.as_mut_ptr().add(i));
-        }
-    }
+    columns_lanes::<V>(enters, leaves, len, column);
     across::<V>(radius, len, column, out);
 }
 

@@ -18,7 +18,7 @@ use rayon::prelude::*;
 
 use super::{
     DenseMaps,
-    moments::{PAD, box_sum},
+    moments::{PAD, across_sum, box_sum, slide_columns},
 };
 use crate::{
     Image, Level,
@@ -64,6 +64,11 @@ struct Buffers {
     /// By row modulo the window: differences, their squares and validity, and first orders.
     rows: [Vec<Vec<f32>>; 4],
     column: Vec<f32>,
+    /// Sums of the first three over the columns of the window, sliding down; begun anew in each band, so
+    /// that they round the same whatever the threads.
+    columns: [Vec<f32>; 3],
+    /// Zeros.
+    nothing: Vec<f32>,
     /// Sums of the same over 13 x 13 pixels, and of validity and first orders over 5 x 5.
     sums: [Vec<f32>; 5],
 }
@@ -150,7 +155,8 @@ impl Buffers {
             rows.resize_with(SIDE, Vec::new);
         }
         let rows = self.rows.iter_mut().flatten();
-        for row in rows.chain([&mut self.column]).chain(&mut self.sums) {
+        let scratch = [&mut self.column, &mut self.nothing].into_iter().chain(&mut self.columns);
+        for row in rows.chain(scratch).chain(&mut self.sums) {
             row.resize(padded, 0.0);
             row.fill(0.0);
         }
@@ -158,6 +164,23 @@ impl Buffers {
 
     /// Takes in the row that is step `y` of a band: estimates of both orders, or beyond the image none.
     fn enter(&mut self, level: Level, estimates: Option<(&[f32], &[f32])>, y: usize) {
+        // What leaves the window is in the slot that is filled next.
+        let len = self.column.len() - 2 * PAD;
+        self.slide(level, y, len, true);
+        self.fill(level, estimates, y);
+        self.slide(level, y, len, false);
+    }
+
+    /// Takes the row in the slot of step `y` off the column sums, or adds it.
+    fn slide(&mut self, level: Level, y: usize, len: usize, leaves: bool) {
+        for (rows, column) in self.rows.iter().zip(&mut self.columns) {
+            let (row, none) = (&rows[y % SIDE][..], &self.nothing[..]);
+            let (enters, leaves) = if leaves { (none, row) } else { (row, none) };
+            slide_columns(level, (enters, leaves), len, column);
+        }
+    }
+
+    fn fill(&mut self, level: Level, estimates: Option<(&[f32], &[f32])>, y: usize) {
         let rows = self.rows.each_mut().map(|rows| &mut rows[y % SIDE][..]);
         let Some((first, second)) = estimates else {
             for row in rows {
@@ -188,14 +211,14 @@ impl Buffers {
     ) {
         let len = out.len().next_multiple_of(WIDEST);
         // Differences, squares and validity widely; validity and first orders narrowly.
-        let sums = [(0, RADIUS), (1, RADIUS), (2, RADIUS), (2, WIDE), (3, WIDE)];
-        for ((k, radius), sum) in sums.into_iter().zip(&mut self.sums) {
-            // Rows in the order of the image: sums round the same in every band.
-            let around: [&[f32]; SIDE] = std::array::from_fn(|j| {
-                let row = y + j.min(2 * radius) + SIDE - radius;
-                &self.rows[k][row % SIDE][..]
-            });
-            box_sum(level, &around[..2 * radius + 1], radius, len, &mut self.column, sum);
+        let (wide, narrow) = self.sums.split_at_mut(3);
+        for (column, sum) in self.columns.iter().zip(wide) {
+            across_sum(level, column, RADIUS, len, sum);
+        }
+        for (rows, sum) in self.rows[2..].iter().zip(narrow) {
+            let around: [&[f32]; 2 * WIDE + 1] =
+                std::array::from_fn(|j| &rows[(y + j + SIDE - WIDE) % SIDE][..]);
+            box_sum(level, &around, WIDE, len, &mut self.column, sum);
         }
         let sums = self.sums.each_ref().map(|sum| &sum[PAD..PAD + out.len()]);
         let blend = Blend { first, second, sums, sigma, zncc_min };

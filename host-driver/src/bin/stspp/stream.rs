@@ -303,7 +303,9 @@ fn summary(stats: &StreamStats, wall_s: f64, output: &Output) {
          frames    left {}, right {}, damaged {}; pairs {}, windows {}, gaps {}\n\
          rejected  {} duplicate, {} late, {} without trigger, {} mislabelled, {} without partner, \
          {} unsynchronised, {} on their way at the end\n\
-         dropped   {} frames, {} pairs, {} windows skipped, {} depth frames not fetched",
+         dropped   {} frames, {} pairs, {} windows skipped, {} depth frames not fetched\n\
+         budget    {} matches took longer than the camera's period, {} were made at first order; one \
+         window of {} is matched",
         stats.depth_frames,
         stats.fps,
         stats.latency_ms,
@@ -327,5 +329,8 @@ fn summary(stats: &StreamStats, wall_s: f64, output: &Output) {
         stats.dropped_pairs,
         stats.skipped_windows,
         stats.dropped_depth,
+        stats.over_budget,
+        stats.reduced_frames,
+        stats.match_every,
     );
 }

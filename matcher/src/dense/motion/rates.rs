@@ -22,6 +22,11 @@ const ALIKE_WEIGHT: f64 = 0.15;
 const NOISE: f32 = 4.5;
 /// ...of more are motion; in between they count in part.
 const MOTION: f32 = 7.0;
+/// Standard deviations up to which a block is taken for still without a fit: its own rate (a quarter of
+/// the blocks around, moving alike, are motion from twice this on), any one's and all together's.
+const STILL_OWN: f32 = 2.2;
+const STILL_ONE: f32 = 4.0;
+const STILL_ALL: f32 = 3.0;
 /// Disparities this far from a block's are on another surface; the slope over a block is allowed for.
 const SURFACE_PX: f32 = 4.0;
 
@@ -185,6 +190,30 @@ fn neighbours(
     down.flat_map(move |r| across.clone().map(move |c| (c, r)))
 }
 
+/// Whether neither a block nor those around, one by one or together, differ from rest by more than noise:
+/// the common case, told without a fit.
+fn is_still(
+    own: &[(f32, f32)],
+    (columns, rows): (usize, usize),
+    (column, row): (usize, usize),
+    noise: f32,
+) -> bool {
+    let (mut sum, mut weights, mut largest) = (0.0f32, 0.0f32, 0.0f32);
+    for r in row.saturating_sub(REACH)..(row + REACH + 1).min(rows) {
+        let from = r * columns + column.saturating_sub(REACH);
+        let to = r * columns + (column + REACH + 1).min(columns);
+        for &(rate, weight) in &own[from..to] {
+            sum += weight * rate;
+            weights += weight;
+            largest = largest.max(weight * rate * rate);
+        }
+    }
+    let (rate, weight) = own[row * columns + column];
+    largest < STILL_ONE.powi(2) * noise
+        && weight * rate * rate < STILL_OWN.powi(2) * noise
+        && sum * sum < STILL_ALL.powi(2) * noise * weights
+}
+
 /// Least squares of a plane through the rates around a block, of those that move as it does.
 fn plane(
     own: &[(f32, f32)],
@@ -198,6 +227,9 @@ fn plane(
         return Around::default();
     }
     let floor = f32::MIN_POSITIVE.max(noise);
+    if is_still(own, (columns, rows), (column, row), floor) {
+        return Around { known: true, ..Around::default() };
+    }
     let (mut m, mut v, mut count) = ([[0.0f64; 3]; 3], [0.0f64; 3], 0);
     let (mut squares, mut all) = (0.0, 0.0);
     for (c, r) in neighbours((column, row), (columns, rows), REACH) {

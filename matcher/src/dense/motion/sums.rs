@@ -152,21 +152,32 @@ impl Scratch {
         }
         for (column, block) in blocks.iter_mut().enumerate() {
             let pixels = column * BLOCK..((column + 1) * BLOCK).min(len);
-            let total = |k: usize| self.sums[k][pixels.clone()].iter().map(|&v| f64::from(v)).sum();
+            let total = |k: usize| {
+                // Four sums side by side do not wait for each other.
+                let mut sums = [0.0f64; 4];
+                for four in self.sums[k][pixels.clone()].chunks_exact(4) {
+                    for (sum, &v) in sums.iter_mut().zip(four) {
+                        *sum += f64::from(v);
+                    }
+                }
+                sums.into_iter().sum()
+            };
             *block = solve(std::array::from_fn(total), frames);
         }
     }
 
     /// The disparities of row `y` that take part, NaN elsewhere.
     fn select(&mut self, frame: &Frame<'_>, y: usize, surfaces: &[(f32, f32)]) {
-        self.w.fill(f32::NAN);
-        let rows = frame.disparity_px.row(y).iter().zip(frame.zncc.row(y));
-        let rows = rows.zip(frame.step.row(y));
-        for (x, (to, ((&d, &zncc), &step))) in self.w.iter_mut().zip(rows).enumerate() {
-            let (low, high) = surfaces[x / BLOCK];
-            let used = step == 0 && zncc >= ZNCC_MIN && d >= low && d <= high;
-            *to = if used { d } else { f32::NAN };
-        }
+        vectorised!(
+            frame.level,
+            select_loop(
+                disparity_px: &[f32] = frame.disparity_px.row(y),
+                zncc: &[f32] = frame.zncc.row(y),
+                step: &[u8] = frame.step.row(y),
+                surfaces: &[(f32, f32)] = surfaces,
+                w: &mut [f32] = &mut self.w,
+            )
+        );
     }
 
     /// Terms of row `y`.
@@ -217,6 +228,40 @@ impl Scratch {
     }
 }
 
+#[inline(always)]
+fn select_loop(
+    disparity_px: &[f32],
+    zncc: &[f32],
+    step: &[u8],
+    surfaces: &[(f32, f32)],
+    w: &mut [f32],
+) {
+    w[disparity_px.len()..].fill(f32::NAN);
+    let rows = disparity_px.chunks(BLOCK).zip(zncc.chunks(BLOCK)).zip(step.chunks(BLOCK));
+    let blocks = w.chunks_mut(BLOCK).zip(surfaces);
+    for (((d, zncc), step), (to, &(low, high))) in rows.zip(blocks) {
+        for (((to, &d), &zncc), &step) in to.iter_mut().zip(d).zip(zncc).zip(step) {
+            let used = (step == 0) & (zncc >= ZNCC_MIN) & (d >= low) & (d <= high);
+            *to = if used { d } else { f32::NAN };
+        }
+    }
+}
+
+#[inline(always)]
+fn bounds_loop(row: &[f32], bounds: &mut [(f32, f32)]) {
+    for (pixels, (low, high)) in row.chunks(BLOCK).zip(bounds) {
+        // NaN loses either comparison.
+        let least = |a: f32, b: f32| if b < a { b } else { a };
+        let most = |a: f32, b: f32| if b > a { b } else { a };
+        let (mut lows, mut highs) = ([f32::INFINITY; BLOCK], [f32::NEG_INFINITY; BLOCK]);
+        for ((low, high), &d) in lows.iter_mut().zip(&mut highs).zip(pixels) {
+            (*low, *high) = (least(*low, d), most(*high, d));
+        }
+        *low = lows.into_iter().fold(*low, least);
+        *high = highs.into_iter().fold(*high, most);
+    }
+}
+
 /// Bounds of the disparities of each block's main surface.
 fn surfaces(
     frame: &Frame<'_>,
@@ -226,13 +271,10 @@ fn surfaces(
     let mut bounds = vec![(f32::INFINITY, f32::NEG_INFINITY); blocks];
     let rows: Vec<&[f32]> = rows.map(|y| frame.disparity_px.row(y)).collect();
     for row in &rows {
-        for (pixels, (low, high)) in row.chunks(BLOCK).zip(&mut bounds) {
-            for &d in pixels {
-                // NaN loses either comparison.
-                *low = if d < *low { d } else { *low };
-                *high = if d > *high { d } else { *high };
-            }
-        }
+        vectorised!(
+            frame.level,
+            bounds_loop(row: &[f32] = row, bounds: &mut [(f32, f32)] = &mut bounds)
+        );
     }
     let mut all = Vec::new();
     for (column, (low, high)) in bounds.iter_mut().enumerate() {
