@@ -61,6 +61,7 @@ pub fn stream_options(source: Option<&Source>, matching: Option<&Matching>) -> S
     StreamOptions {
         matching: matching.map_or(defaults.matching.clone(), Matching::options),
         timeout: timeout.filter(|timeout| !timeout.is_zero()).unwrap_or(defaults.timeout),
+        budget: defaults.budget,
     }
 }
 
