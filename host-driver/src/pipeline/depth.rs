@@ -268,8 +268,11 @@ impl MatchThread {
     fn complete(&mut self, pair: &LabelledPair) -> bool {
         self.progress.count(|s| s.windows += 1);
         // When a newer pair waits already, this window is late: the newest is matched. A machine on which
-        // one always waits matches now and then all the same.
-        if !self.lossless && !self.input.is_empty() && self.skipped_in_row < PAIR_QUEUE {
+        // one always waits matches now and then all the same; so does one that cannot even rectify in
+        // time: when its queue fills, pairs will be dropped, and this may be the last complete window.
+        let waiting = self.input.len();
+        let newer_is_sure = (1..PAIR_QUEUE / 2).contains(&waiting);
+        if !self.lossless && newer_is_sure && self.skipped_in_row < PAIR_QUEUE {
             self.skipped_in_row += 1;
             self.progress.count(|s| s.skipped_windows += 1);
             return true;
