@@ -56,7 +56,7 @@ def semi_global(folder, mode, repeats):
     size = left.shape[::-1]
     (k0, d0), (k1, d1) = ((c["K"], c["D"]) for c in cameras)
     r0, r1, p0, p1 = cv2.stereoRectify(
-        k0, d0, k1, d1, size, right_from_left[:3, :3], right_from_left[:3, 3], flags=0)[:4]
+        k0, d0, k1, d1, size, right_from_left[:3, :3].copy(), right_from_left[:3, 3:].copy(), flags=0)[:4]
     rectified = []
     for image, k, d, r, p in ((left, k0, d0, r0, p0), (right, k1, d1, r1, p1)):
         maps = cv2.initUndistortRectifyMap(k, d, r, p, size, cv2.CV_32FC1)
@@ -105,7 +105,8 @@ def ours(folder):
 def find_steps(report):
     """The list of steps, wherever the report keeps it."""
     for value in report.values():
-        if isinstance(value, list) and value and isinstance(value[0], dict) and "stage" in value[0]:
+        if isinstance(value, list) and any(
+                isinstance(step, dict) and step.get("stage") == "match" for step in value):
             return value
         if isinstance(value, dict) and (inner := find_steps(value)):
             return inner
