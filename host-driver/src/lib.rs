@@ -20,8 +20,11 @@ pub mod calibrate;
 pub mod calibration;
 pub mod check;
 pub mod cpu_time;
+#[cfg(feature = "sim")]
+pub mod experiment;
 pub mod export;
 pub mod frame;
+pub mod fuse;
 pub mod geometry;
 pub mod image_io;
 pub mod measure;

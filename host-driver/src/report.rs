@@ -54,6 +54,14 @@ impl Summary {
     }
 }
 
+/// Most memory that this process has used so far; `None` where the system does not tell.
+pub fn peak_memory_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;
+    let kib: u64 = line.split_ascii_whitespace().nth(1)?.parse().ok()?;
+    Some(kib * 1024)
+}
+
 /// The matcher's parameters as JSON.
 pub fn params_json(params: &Params) -> Value {
     let a = &params.advanced;

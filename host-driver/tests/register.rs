@@ -115,3 +115,46 @@ fn what_cannot_be_registered_is_refused() {
     assert!(CloudSurface::new(&nothing).is_err());
     assert!(target.closest(&Point3::new(0.0, 0.0, 5.0), 0.1).is_none());
 }
+
+/// A bump-covered block that looks different from every side, seen from one: points that face `to`.
+fn blob(seen_from: Vector3<f64>, shift: f64) -> Vec<Point3<f64>> {
+    (0..40_000)
+        .map(|k| {
+            let z = 1.0 - 2.0 * (f64::from(k) + 0.5 + shift) / 40_000.0;
+            let turn = f64::from(k) * 2.399_963_229_728_653 + shift;
+            let r = (1.0 - z * z).sqrt();
+            let d = Vector3::new(r * turn.cos(), r * turn.sin(), z);
+            let bumps = 0.02 * (5.0 * d.x + 1.0).sin() * (4.0 * d.y).cos()
+                + 0.015 * (7.0 * d.z - 2.0 * d.x).sin()
+                + 0.02 * (3.0 * d.y + 2.0).sin();
+            (d, Point3::from(d.component_mul(&Vector3::new(0.12, 0.16, 0.2)) * (1.0 + 4.0 * bumps)))
+        })
+        .filter(|(d, _)| d.dot(&seen_from.normalize()) > 0.1)
+        .map(|(_, p)| p)
+        .collect()
+}
+
+#[test]
+fn views_meet_from_anywhere() {
+    use stspp::register::global::{self, GlobalParams};
+    let target = blob(Vector3::new(0.0, 0.0, 1.0), 0.0);
+    // Seen from 40 degrees away, and laid down anyhow.
+    let seen = blob(Vector3::new(0.64, 0.1, 0.77), 0.3);
+    for turn in [Vector3::new(0.3, 2.0, -1.0), Vector3::new(-2.5, 0.4, 1.1)] {
+        let truth = Isometry3::new(Vector3::new(0.4, -0.3, 0.9), turn);
+        let source: Vec<_> = seen.iter().map(|p| truth.inverse() * p).collect();
+        let coarse = global::register(&source, &target, &GlobalParams::default()).unwrap();
+        let surface = CloudSurface::new(&target).unwrap();
+        let params = IcpParams { max_distance_m: coarse.reach_m, ..IcpParams::default() };
+        let fine = register(&source, &surface, coarse.target_from_source, &params).unwrap();
+        let error = fine.target_from_source * truth.inverse();
+        let worst = target.iter().map(|p| (error * p - p).norm()).fold(0.0, f64::max);
+        assert!(worst < 1e-4, "off by {worst} m, overlap {}", coarse.overlap);
+    }
+    // Another object: a flat plate cannot be laid on it.
+    let plate: Vec<_> = (0..10_000)
+        .map(|k| Point3::new(f64::from(k % 100) * 5e-3, f64::from(k / 100) * 5e-3, 1.0))
+        .collect();
+    let error = global::register(&plate, &target, &GlobalParams::default()).unwrap_err();
+    assert!(matches!(error, RegisterError::NoPose { .. }), "{error}");
+}

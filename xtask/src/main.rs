@@ -1,12 +1,14 @@
 //! Build and test tasks: `cargo xtask help`.
 
 mod arrows;
+mod book;
 mod debian;
 mod e2e;
 mod firmware;
 mod kernels;
 mod licences;
 mod peers;
+mod protocol_reference;
 mod stage;
 mod test;
 mod workspace;
@@ -16,6 +18,9 @@ use std::process::ExitCode;
 const HELP: &str = "\
 cargo xtask test [--quick]   everything that is proven: formatting, lints, dependency arrows,
                              licences, tests. --quick leaves out the stages that need Debian packages
+cargo xtask book             check the book under docs/; builds it into target/book where mdbook is
+cargo xtask protocol-reference
+                             write docs/protocol-reference.md from the protocol's types
 cargo xtask arrows           check which crate may depend on which
 cargo xtask licences         check the licences of everything that ships against deny.toml
 cargo xtask firmware [f330] [f350] [--install] [--exercise] [--test]
@@ -40,6 +45,8 @@ fn main() -> ExitCode {
         ["e2e", only] => e2e::run(Some(only)),
         ["kernels"] => return test::kernels(),
         ["peers"] => peers::table(&workspace::root()),
+        ["book"] => book::run(),
+        ["protocol-reference"] => protocol_reference::write(),
         ["arrows"] => workspace::metadata().and_then(|m| arrows::check(&m)),
         ["licences"] => workspace::metadata().and_then(|m| licences::check(&m)),
         ["firmware", rest @ ..] => firmware::run(rest),

@@ -2,7 +2,7 @@
 //! one failed, so that one run shows all that is wrong.
 
 use crate::stage::{self, Outcome, Stage};
-use crate::{arrows, firmware, kernels, licences, workspace};
+use crate::{arrows, book, firmware, kernels, licences, workspace};
 use std::process::{Command, ExitCode};
 
 /// How much to test.
@@ -30,6 +30,7 @@ pub fn run(depth: Depth) -> ExitCode {
         stage::run("formatting", || stage::command(cargo(&["fmt", "--all", "--check"]))),
         stage::run("dependency arrows", || with_metadata(arrows::check)),
         stage::run("licences", || with_metadata(licences::check)),
+        stage::run("book", || stage::check(book::run())),
         stage::run("lints", || {
             stage::command(cargo(&[
                 "clippy",

@@ -52,15 +52,25 @@ impl Capture {
         frames: usize,
         progress: &mut dyn FnMut(usize),
     ) -> Result<Self, WorldError> {
-        let calibration = calibration_of(&model);
-        let world = World::new(scene, model)?;
+        Ok(Self::record_from(World::new(scene, model)?, 0, frames, progress))
+    }
+
+    /// Records `frames` pairs of a world from frame `first` of its time on: for scenes that move.
+    pub fn record_from(
+        world: World,
+        first: usize,
+        frames: usize,
+        progress: &mut dyn FnMut(usize),
+    ) -> Self {
+        let calibration = calibration_of(world.model());
         let (mut pairs, mut labels) = (Vec::new(), Vec::new());
-        for k in 0..frames {
-            progress(k);
+        for index in 0..frames {
+            progress(index);
+            let k = first + index;
             let trigger_time_us = k as u64 * FRAME_PERIOD_US;
             let (open_ns, close_ns) =
                 (trigger_time_us * 1000, (trigger_time_us + EXPOSURE_US) * 1000);
-            let projector = (k % world.model().projectors.len().max(1)) as u8;
+            let projector = (index % world.model().projectors.len().max(1)) as u8;
             let light = LightInterval {
                 source: LightSource::Projector(projector),
                 on_ns: open_ns,
@@ -70,14 +80,14 @@ impl Capture {
             pairs.push(StereoPair { left: raw_of(left), right: raw_of(right) });
             labels.push(SlotLabel {
                 sequence: k as u32,
-                slot: k as u16,
+                slot: index as u16,
                 projector_mask: 1 << projector,
                 floodlight: false,
                 trigger_time_us,
                 exposure_us: EXPOSURE_US as u32,
             });
         }
-        Ok(Self { world, calibration, pairs, labels })
+        Self { world, calibration, pairs, labels }
     }
 
     /// Part of the pixels, of both cameras, that are at full scale: their dots are cut off.

@@ -6,6 +6,7 @@ use stspp_matcher::Image;
 
 use super::CanvasTruth;
 use super::score::OUTLIER_M;
+use crate::export::colour;
 use crate::{DepthFrame, image_io};
 
 /// Seen by both cameras but not reconstructed.
@@ -38,9 +39,7 @@ pub fn write_error_png(
                 }
                 MISSING
             } else if error.abs() <= OUTLIER_M {
-                let t = (error * 1e3 / full_mm).clamp(-1.0, 1.0);
-                let other = ((1.0 - t.abs()) * 255.0) as u8;
-                if t < 0.0 { [other, other, 255] } else { [255, other, other] }
+                colour::diverging(f64::from(error * 1e3 / full_mm))
             } else {
                 OUTLIER
             };

@@ -5,6 +5,13 @@
 /// Colour of invalid pixels.
 pub const INVALID: [u8; 3] = [12, 12, 14];
 
+/// Colour of a signed value from -1 (blue) over 0 (white) to 1 (red); beyond, the ends.
+pub fn diverging(t: f64) -> [u8; 3] {
+    let t = t.clamp(-1.0, 1.0);
+    let other = ((1.0 - t.abs()) * 255.0) as u8;
+    if t < 0.0 { [other, other, 255] } else { [255, other, other] }
+}
+
 /// 256 colours: 0 is far (blue), 255 near (red).
 pub fn table() -> [[u8; 3]; 256] {
     std::array::from_fn(|k| {

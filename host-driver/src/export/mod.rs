@@ -4,5 +4,6 @@ pub mod atomic;
 pub mod colour;
 pub mod folder;
 pub mod images;
+pub mod model;
 pub mod outputs;
 pub mod ply;

@@ -85,6 +85,47 @@ pub enum PlyError {
         /// What is wrong.
         reason: &'static str,
     },
+    /// A face is none.
+    #[error("face {index} of {count}: {reason}")]
+    Face {
+        /// Index of the face.
+        index: usize,
+        /// Faces that the header announces.
+        count: usize,
+        /// What is wrong.
+        reason: &'static str,
+    },
+}
+
+/// Writes points with a colour and a signed deviation each, for viewers: float x y z in metres, float
+/// deviation_mm, uchar red green blue.
+///
+/// # Errors
+/// From `out`.
+pub fn write_coloured(
+    out: &mut dyn Write,
+    points_m: &[Point3<f64>],
+    deviation_m: &[f64],
+    colours: &[[u8; 3]],
+) -> io::Result<()> {
+    let count = points_m.len().min(deviation_m.len()).min(colours.len());
+    write!(
+        out,
+        "ply\nformat binary_little_endian 1.0\n\
+         comment unit metre, deviation in millimetres, nan where the reference is far\n\
+         element vertex {count}\n\
+         property float x\nproperty float y\nproperty float z\nproperty float deviation_mm\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    )?;
+    for ((point, deviation), colour) in points_m.iter().zip(deviation_m).zip(colours) {
+        let mut bytes = [0; 19];
+        for (k, value) in [point.x, point.y, point.z, deviation * 1e3].into_iter().enumerate() {
+            bytes[4 * k..4 * k + 4].copy_from_slice(&(value as f32).to_le_bytes());
+        }
+        bytes[16..].copy_from_slice(colour);
+        out.write_all(&bytes)?;
+    }
+    Ok(())
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -167,8 +208,114 @@ const ROLES: [&str; 5] = ["x", "y", "z", "zncc", "intensity"];
 /// # Errors
 /// Names the header line or the point.
 pub fn read(source: &mut dyn BufRead) -> Result<PointCloud, PlyError> {
-    let (format, count, properties) = read_header(source)?;
+    let header = read_header(source)?;
     let mut cloud = PointCloud::default();
+    read_points(source, &header, &mut |[x, y, z, zncc, intensity]| {
+        cloud.points_left_m.push(Point3::new(x as f32, y as f32, z as f32));
+        cloud.zncc.push(zncc as f32);
+        cloud.intensity.push(intensity as u8);
+    })?;
+    Ok(cloud)
+}
+
+/// Vertices and triangles of a PLY file.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PlyMesh {
+    /// Positions in the file's units.
+    pub vertices: Vec<[f64; 3]>,
+    /// Indices of each triangle's corners; faces of more corners are fans. Empty for a point cloud.
+    pub faces: Vec<[u32; 3]>,
+}
+
+/// Reads vertices and, if the element after them is `face`, its triangles.
+///
+/// # Errors
+/// Names the header line, the point or the face.
+pub fn read_mesh(source: &mut dyn BufRead) -> Result<PlyMesh, PlyError> {
+    let header = read_header(source)?;
+    let mut mesh = PlyMesh::default();
+    read_points(source, &header, &mut |[x, y, z, ..]| mesh.vertices.push([x, y, z]))?;
+    let Some((count, properties)) = &header.faces else { return Ok(mesh) };
+    let mut words = Words { format: header.format, line: Vec::new(), at: 0 };
+    for index in 0..*count {
+        let wrong = |reason| PlyError::Face { index, count: *count, reason };
+        let mut corners: Vec<f64> = Vec::new();
+        words.next_line(source)?;
+        for property in properties {
+            let mut next = |kind| {
+                words
+                    .next(source, kind)
+                    .map_err(|e| e.unwrap_or_else(|| wrong("the file ends within it")))
+            };
+            match property {
+                FaceProperty::Scalar(kind) => {
+                    next(*kind)?;
+                }
+                FaceProperty::List { length, item, is_corners } => {
+                    let length = next(*length)?;
+                    if !(0.0..=1e4).contains(&length) {
+                        return Err(wrong("a list that long is none of corners"));
+                    }
+                    for _ in 0..length as usize {
+                        let value = next(*item)?;
+                        if *is_corners {
+                            corners.push(value);
+                        }
+                    }
+                }
+            }
+        }
+        if corners.iter().any(|c| *c < 0.0 || *c >= mesh.vertices.len() as f64) {
+            return Err(wrong("a corner is no vertex"));
+        }
+        for k in 2..corners.len() {
+            mesh.faces.push([corners[0], corners[k - 1], corners[k]].map(|c| c as u32));
+        }
+    }
+    Ok(mesh)
+}
+
+/// Values of an element with lists, one after the other.
+struct Words {
+    format: Format,
+    line: Vec<f64>,
+    at: usize,
+}
+
+impl Words {
+    fn next_line(&mut self, source: &mut dyn BufRead) -> io::Result<()> {
+        if self.format == Format::Ascii {
+            let mut text = String::new();
+            io::Read::take(&mut *source, 1 << 20).read_line(&mut text)?;
+            self.line = text.split_ascii_whitespace().map_while(|w| w.parse().ok()).collect();
+            self.at = 0;
+        }
+        Ok(())
+    }
+
+    /// The next value; an error without a cause is the end.
+    fn next(&mut self, source: &mut dyn BufRead, kind: Kind) -> Result<f64, Option<PlyError>> {
+        if self.format == Format::Ascii {
+            self.at += 1;
+            return self.line.get(self.at - 1).copied().ok_or(None);
+        }
+        let mut bytes = [0; 8];
+        let raw = &mut bytes[..kind.size()];
+        source.read_exact(raw).map_err(|e| match e.kind() {
+            io::ErrorKind::UnexpectedEof => None,
+            _ => Some(e.into()),
+        })?;
+        Ok(kind.decode(raw, self.format == Format::Big))
+    }
+}
+
+fn read_points(
+    source: &mut dyn BufRead,
+    header: &Header,
+    each: &mut dyn FnMut([f64; 5]),
+) -> Result<(), PlyError> {
+    let Header { format, count, properties, .. } = header;
+    let (format, count) = (*format, *count);
     let mut text = String::new();
     let mut bytes = vec![0; properties.iter().map(|p| p.kind.size()).sum()];
     for index in 0..count {
@@ -180,7 +327,7 @@ pub fn read(source: &mut dyn BufRead) -> Result<PointCloud, PlyError> {
                 return Err(wrong("the file ends before it"));
             }
             let mut words = text.split_ascii_whitespace();
-            for property in &properties {
+            for property in properties {
                 let word = words.next().ok_or_else(|| wrong("fewer values than properties"))?;
                 let value = word.parse().map_err(|_| wrong("a value is no number"))?;
                 if let Some(role) = property.role {
@@ -193,7 +340,7 @@ pub fn read(source: &mut dyn BufRead) -> Result<PointCloud, PlyError> {
                 _ => e.into(),
             })?;
             let mut at = 0;
-            for property in &properties {
+            for property in properties {
                 let raw = &bytes[at..at + property.kind.size()];
                 if let Some(role) = property.role {
                     values[role] = property.kind.decode(raw, format == Format::Big);
@@ -201,16 +348,31 @@ pub fn read(source: &mut dyn BufRead) -> Result<PointCloud, PlyError> {
                 at += raw.len();
             }
         }
-        let [x, y, z, zncc, intensity] = values;
-        cloud.points_left_m.push(Point3::new(x as f32, y as f32, z as f32));
-        cloud.zncc.push(zncc as f32);
-        cloud.intensity.push(intensity as u8);
+        each(values);
     }
-    Ok(cloud)
+    Ok(())
 }
 
-fn read_header(source: &mut dyn BufRead) -> Result<(Format, usize, Vec<Property>), PlyError> {
+/// What the header of a PLY file announces.
+struct Header {
+    format: Format,
+    count: usize,
+    properties: Vec<Property>,
+    /// Faces right after the points: their number and properties.
+    faces: Option<(usize, Vec<FaceProperty>)>,
+}
+
+/// A property of a face.
+enum FaceProperty {
+    Scalar(Kind),
+    List { length: Kind, item: Kind, is_corners: bool },
+}
+
+fn read_header(source: &mut dyn BufRead) -> Result<Header, PlyError> {
     let mut format = None;
+    let mut faces: Option<(usize, Vec<FaceProperty>)> = None;
+    let mut elements = 0;
+    let mut in_faces = false;
     let mut count = None;
     let mut in_vertex = false;
     let mut properties = Vec::new();
@@ -240,11 +402,19 @@ fn read_header(source: &mut dyn BufRead) -> Result<(Format, usize, Vec<Property>
             (["element", "vertex", n], _) if count.is_none() => {
                 count = Some(n.parse().map_err(|_| wrong("a number of points"))?);
                 in_vertex = true;
+                elements = 1;
             }
             (["element", ..], _) if count.is_none() => {
                 return Err(wrong("the points (`element vertex`) first"));
             }
-            (["element", _, _], _) => in_vertex = false,
+            (["element", name, n], _) => {
+                elements += 1;
+                in_vertex = false;
+                in_faces = elements == 2 && *name == "face";
+                if in_faces {
+                    faces = Some((n.parse().map_err(|_| wrong("a number of faces"))?, Vec::new()));
+                }
+            }
             (["property", "list", ..], _) if in_vertex => {
                 return Err(wrong("scalar properties of points"));
             }
@@ -256,6 +426,20 @@ fn read_header(source: &mut dyn BufRead) -> Result<(Format, usize, Vec<Property>
                 }
                 properties.push(Property { role, kind });
             }
+            (["property", "list", length, item, name], _) if in_faces => {
+                let kind = |name: &str| Kind::parse(name).ok_or_else(|| wrong("a scalar type"));
+                let is_corners = matches!(*name, "vertex_indices" | "vertex_index");
+                let (length, item) = (kind(length)?, kind(item)?);
+                if let Some((_, properties)) = &mut faces {
+                    properties.push(FaceProperty::List { length, item, is_corners });
+                }
+            }
+            (["property", kind, _], _) if in_faces => {
+                let kind = Kind::parse(kind).ok_or_else(|| wrong("a scalar type"))?;
+                if let Some((_, properties)) = &mut faces {
+                    properties.push(FaceProperty::Scalar(kind));
+                }
+            }
             (["property", ..], _) if !in_vertex => {}
             (["end_header"], _) => {
                 let (Some(format), Some(count)) = (format, count) else {
@@ -264,7 +448,7 @@ fn read_header(source: &mut dyn BufRead) -> Result<(Format, usize, Vec<Property>
                 if found[..3] != [true; 3] {
                     return Err(wrong("properties x, y and z before it"));
                 }
-                return Ok((format, count, properties));
+                return Ok(Header { format, count, properties, faces });
             }
             _ => return Err(wrong("a PLY header line")),
         }

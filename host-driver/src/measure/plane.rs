@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
+use super::robust::Shape;
 use super::{FitError, rms};
 
 /// A fitted plane.
@@ -55,6 +56,19 @@ pub fn fit(points_m: &[Point3<f64>]) -> Result<PlaneFit, FitError> {
     let mut plane = PlaneFit { point_m: centroid.into(), normal, rms_m: 0.0, points: count };
     plane.rms_m = rms(finite().map(|p| plane.distance_m(p)));
     Ok(plane)
+}
+
+impl Shape for PlaneFit {
+    const NAME: &'static str = "plane";
+    const SAMPLE: usize = 3;
+
+    fn fit(points_m: &[Point3<f64>]) -> Result<Self, FitError> {
+        fit(points_m)
+    }
+
+    fn distance_m(&self, point_m: &Point3<f64>) -> f64 {
+        PlaneFit::distance_m(self, point_m)
+    }
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix4, Point3, Vector3, Vector4};
 
+use super::robust::Shape;
 use super::{FitError, rms};
 
 /// Gauss-Newton steps at most; a handful suffice.
@@ -112,6 +113,19 @@ fn fit_with(points_m: &[Point3<f64>], radius_m: Option<f64>) -> Result<SphereFit
     };
     sphere.rms_m = rms(finite().map(|p| sphere.distance_m(p)));
     Ok(sphere)
+}
+
+impl Shape for SphereFit {
+    const NAME: &'static str = "sphere";
+    const SAMPLE: usize = 4;
+
+    fn fit(points_m: &[Point3<f64>]) -> Result<Self, FitError> {
+        fit(points_m)
+    }
+
+    fn distance_m(&self, point_m: &Point3<f64>) -> f64 {
+        SphereFit::distance_m(self, point_m)
+    }
 }
 
 #[cfg(test)]

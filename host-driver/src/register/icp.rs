@@ -58,6 +58,17 @@ pub struct IcpResult {
     pub settled: bool,
 }
 
+impl IcpResult {
+    /// [`IcpResult::information`] for a twist about the target's origin, as a pose graph's edges are
+    /// weighed: the centroid moves by t + w x c.
+    pub fn information_about_origin(&self) -> Matrix6<f64> {
+        let mut centroid_from_origin = Matrix6::identity();
+        let cross = self.centroid_m.coords.cross_matrix();
+        centroid_from_origin.fixed_view_mut::<3, 3>(3, 0).copy_from(&-cross);
+        centroid_from_origin.transpose() * self.information * centroid_from_origin
+    }
+}
+
 /// A source point and the closest point of the target.
 struct Pair {
     /// Signed distance along the target's normal, metres.
@@ -124,7 +135,7 @@ fn iterate(
     let mut settled = false;
     for _ in 0..iterations_max {
         let pairs = pair(source, target, pose, *gate_m, params.keep)?;
-        let (normal, right, centroid, _) = normal_equations(&pairs);
+        let (normal, right, centroid, squares) = normal_equations(&pairs);
         check_rank(&normal, pairs.len())?;
         let twist = -normal.cholesky().ok_or(RegisterError::Degenerate { free: 1 })?.solve(&right);
         *pose = about(&centroid, &motion_of_twist(&twist)) * *pose;
@@ -133,7 +144,11 @@ fn iterate(
         // Six times the median holds nearly all true pairs, whatever noise or spacing it comes from.
         let median_m = median(pairs.iter().map(|p| p.point_m));
         *gate_m = (*gate_m).min((6.0 * median_m).max(2.0 * moved_m).max(params.min_distance_m));
-        settled = turned_rad < settled_rad && moved_m < settled_m;
+        // A step of a tenth of the pose's own standard deviation says nothing any more: with noisy
+        // clouds, pairs change for ever without leading anywhere.
+        let variance = squares / pairs.len() as f64;
+        let insignificant = twist.dot(&(normal * twist)) < 0.01 * variance;
+        settled = (turned_rad < settled_rad && moved_m < settled_m) || insignificant;
         if settled {
             break;
         }

@@ -1,17 +1,20 @@
 //! Registration: which rigid motion lays one cloud on another cloud or on a mesh.
 //!
 //! ```text
+//! anywhere      ──► global ──► a start
 //! source points ──► closest point on a Surface ──► point-to-plane step ──► target_from_source
 //!                        (cloud or mesh)                (icp)
 //! many clouds   ──► pairwise motions ──► pose_graph ──► one motion each, loops closed
 //! ```
 //! All lengths are metres, all motions are named `a_from_b`.
 
+pub mod global;
 pub mod icp;
 pub mod mesh_surface;
 pub mod normals;
 pub mod pose_graph;
 pub mod surface;
+pub mod thin;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3, Vector6};
 
@@ -48,6 +51,18 @@ pub enum RegisterError {
     Degenerate {
         /// Number of directions that are not fixed.
         free: usize,
+    },
+    /// No motion lays one cloud on the other.
+    #[error(
+        "no pose lays more than {:.0} % of the source on the target ({:.0} % are needed): the clouds \
+         do not overlap, or are not of the same object and scale",
+        100.0 * .overlap, 100.0 * .needed
+    )]
+    NoPose {
+        /// The largest overlap found, a share.
+        overlap: f64,
+        /// The least share that counts.
+        needed: f64,
     },
     /// A mesh without area.
     #[error("the mesh has no triangle with area")]

@@ -20,7 +20,7 @@ impl Default for Normals {
 }
 
 /// Unit normals of `points_m`, signs arbitrary, by principal components of the nearest neighbours.
-pub(super) fn estimate_normals(
+pub(crate) fn estimate_normals(
     points_m: &[[f64; 3]],
     tree: &ImmutableKdTree<f64, 3>,
     params: &Normals,

@@ -12,7 +12,8 @@ pub struct Edge {
     pub source: usize,
     /// Maps points of `source` to `target`.
     pub target_from_source: Isometry3<f64>,
-    /// Weight of the twist's components, as [`super::icp::IcpResult::information`].
+    /// Weight of the twist's components about the target's origin, as
+    /// [`super::icp::IcpResult::information_about_origin`].
     pub information: Matrix6<f64>,
 }
 

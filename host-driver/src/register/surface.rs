@@ -21,6 +21,12 @@ pub trait Surface: Sync {
     /// The point of the surface closest to `query_m`, or `None` when there is none within
     /// `max_distance_m`.
     fn closest(&self, query_m: &Point3<f64>, max_distance_m: f64) -> Option<Closest>;
+
+    /// Whether the surface is known at points only, so that the closest one is off by their spacing
+    /// and distances are those along its normal.
+    fn is_sampled(&self) -> bool {
+        false
+    }
 }
 
 /// A cloud of surface points with normals, searched by a k-d tree.
@@ -64,6 +70,10 @@ impl CloudSurface {
 }
 
 impl Surface for CloudSurface {
+    fn is_sampled(&self) -> bool {
+        true
+    }
+
     fn closest(&self, query_m: &Point3<f64>, max_distance_m: f64) -> Option<Closest> {
         let query = [query_m.x, query_m.y, query_m.z];
         let nearest = self.tree.query(&query).nearest_one::<SquaredEuclidean<f64>>().execute();

@@ -6,6 +6,7 @@ mod accuracy;
 mod calibration;
 #[cfg(feature = "sim")]
 mod check;
+mod icp;
 mod timing;
 
 use clap::Subcommand;
@@ -25,6 +26,7 @@ pub struct Args {
 
 #[derive(Subcommand)]
 enum What {
+    Icp(icp::Args),
     #[cfg(feature = "sim")]
     Accuracy(accuracy::Args),
     #[cfg(feature = "sim")]
@@ -36,14 +38,13 @@ enum What {
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     match &args.what {
+        Some(What::Icp(args)) => icp::run(args, output),
         #[cfg(feature = "sim")]
         Some(What::Accuracy(args)) => accuracy::run(args, output),
         #[cfg(feature = "sim")]
         Some(What::Calibration(args)) => calibration::run(args, output),
         #[cfg(feature = "sim")]
         Some(What::Check(args)) => check::run(args, output),
-        #[cfg(not(feature = "sim"))]
-        Some(_) => Ok(()),
         None => timing::run(&args.timing, output),
     }
 }

@@ -11,10 +11,14 @@ mod demo;
 mod doctor;
 #[allow(dead_code, reason = "the table of exit codes is whole, whoever uses it")]
 mod exit;
+#[cfg(feature = "sim")]
+mod experiment;
 mod frame_report;
+mod fuse;
 mod info;
 mod interrupt;
 mod list;
+mod measure;
 mod output;
 mod reconstruct;
 mod record;
@@ -60,6 +64,10 @@ enum Verb {
     Play(stream::PlayArgs),
     Calibrate(Box<calibrate::Args>),
     Check(check::Args),
+    Measure(measure::Args),
+    Fuse(fuse::Args),
+    #[cfg(feature = "sim")]
+    Experiment(experiment::Args),
     Bench(bench::Args),
     Completions(completions::Args),
 }
@@ -83,6 +91,10 @@ fn main() -> ExitCode {
         Verb::Play(args) => stream::play(&args, &output),
         Verb::Calibrate(args) => calibrate::run(&args, &output),
         Verb::Check(args) => check::run(&args, &output),
+        Verb::Measure(args) => measure::run(&args, &output),
+        Verb::Fuse(args) => fuse::run(&args, &output),
+        #[cfg(feature = "sim")]
+        Verb::Experiment(args) => experiment::run(&args, &output),
         Verb::Bench(args) => bench::run(&args, &output),
         Verb::Completions(args) => completions::run(&args),
     };

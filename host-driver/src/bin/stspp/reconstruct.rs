@@ -88,21 +88,35 @@ pub enum OrderName {
     Auto,
 }
 
+impl MethodName {
+    /// The library's method.
+    pub fn method(self) -> Method {
+        match self {
+            Self::Parabola => Method::Parabola,
+            Self::Icgn => Method::IcGn,
+            Self::Dense => Method::Dense,
+        }
+    }
+}
+
+impl OrderName {
+    /// The library's order.
+    pub fn shape(self) -> ShapeFunction {
+        match self {
+            Self::First => ShapeFunction::First,
+            Self::Second => ShapeFunction::Second,
+            Self::Auto => ShapeFunction::Auto,
+        }
+    }
+}
+
 impl Matching {
     /// The library's options.
     pub fn options(&self) -> Options {
         Options {
             depth: DepthRange { min_m: self.depth_min, max_m: self.depth_max },
-            method: match self.method {
-                MethodName::Parabola => Method::Parabola,
-                MethodName::Icgn => Method::IcGn,
-                MethodName::Dense => Method::Dense,
-            },
-            shape: match self.order {
-                OrderName::First => ShapeFunction::First,
-                OrderName::Second => ShapeFunction::Second,
-                OrderName::Auto => ShapeFunction::Auto,
-            },
+            method: self.method.method(),
+            shape: self.order.shape(),
             frames: self.frames,
             first: 0,
             threads: self.threads,
