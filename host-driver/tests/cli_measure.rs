@@ -36,6 +36,7 @@ fn write(path: &Path, points: &[Point3<f64>]) -> String {
         points_left_m: points.iter().map(|p| p.cast()).collect(),
         zncc: vec![1.0; points.len()],
         intensity: vec![128; points.len()],
+        ..PointCloud::default()
     };
     cloud.write_ply(path).unwrap();
     path.to_str().unwrap().to_owned()

@@ -1,7 +1,7 @@
 //! Figure 5: planes at 0.8 to 2 m, over the number of patterns.
 
 use super::{Chart, ExperimentError, Figure, Row, Section, Series, Studio, pictures};
-use crate::accuracy::score::central_plane_rms_mm;
+use crate::accuracy::score::central_plane_mm;
 use crate::measure::camera::flat_target;
 use crate::measure::region::Region;
 use crate::rectify::DepthRange;
@@ -47,7 +47,7 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
         paper.extend(paper_rms.map(|rms| (distance_m, rms)));
         for (count, series) in COUNTS.into_iter().zip(&mut series) {
             let frame = studio.matched(&take, count, |_| ())?;
-            let rms_mm = central_plane_rms_mm(&frame, &truth)?;
+            let (rms_mm, _) = central_plane_mm(&frame, &truth)?;
             series.points.push((distance_m, rms_mm));
             if count == 3 && paper_rms.is_some() {
                 section.rows.push(

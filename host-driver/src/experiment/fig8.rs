@@ -2,13 +2,12 @@
 
 use nalgebra::{Isometry3, Point3};
 
-use super::fig6::{distances, surface_rms_mm};
+use super::fig6::{distances, surface_of, surface_rms_mm};
 use super::studio::FRAMES;
 use super::{ExperimentError, Figure, Row, Section, Studio, pictures};
 use crate::fuse::{self, FuseParams, Start, View};
 use crate::measure::rms;
 use crate::rectify::DepthRange;
-use crate::register::mesh_surface::MeshSurface;
 
 /// Shifts of the panel before the sensor for the near views, mm to the right and down.
 const NEAR: [(&str, &str); 6] = [
@@ -36,11 +35,7 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
     );
     let far = studio.take("panel", &[("distance_m", "1.6")], 0)?;
     let frame = studio.matched(&far, FRAMES, |_| ())?;
-    let mesh = far.world.truth().mesh(0, far.centre_ns).ok_or_else(|| {
-        ExperimentError::Missing { figure: "fig8", what: "the panel has no mesh".into() }
-    })?;
-    let corner = |i: u32| Point3::from(mesh.vertices_left_m[i as usize]);
-    let surface = MeshSurface::new(mesh.triangles.iter().map(|t| t.map(corner)))?;
+    let surface = surface_of(&far, far.centre_ns, "fig8")?;
     let cloud = frame.point_cloud();
     let points: Vec<Point3<f64>> = cloud.points_left_m.iter().map(|p| p.cast()).collect();
     let alone_mm = surface_rms_mm(&points, &surface);

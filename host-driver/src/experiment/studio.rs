@@ -40,6 +40,13 @@ pub struct Take {
     pub centre_ns: u64,
 }
 
+impl Take {
+    /// The time that a frame's depth refers to, nanoseconds of the scene's time.
+    pub fn time_ns(&self, frame: &DepthFrame) -> u64 {
+        frame.time_device_s.map_or(self.centre_ns, |time_s| (time_s * 1e9) as u64)
+    }
+}
+
 impl<'a> Studio<'a> {
     /// A studio that keeps its recordings in `folder`. `asked` say how is matched where the figures' own
     /// ways are not wanted.
@@ -158,11 +165,16 @@ impl<'a> Studio<'a> {
         Ok(take.stack.depth_frame(&mut matcher, 0..frames)?)
     }
 
-    /// Traces the truth of a take's canvas at the middle of its exposures.
+    /// Traces the truth of a still take's canvas.
     pub fn truth(&mut self, take: &Take) -> CanvasTruth {
+        self.truth_at(take, take.centre_ns)
+    }
+
+    /// Traces the truth of a take's canvas at a time.
+    pub fn truth_at(&mut self, take: &Take, time_ns: u64) -> CanvasTruth {
         self.say("tracing the truth");
         let rectifier = &take.stack.rectifier;
-        CanvasTruth::trace(&take.world, rectifier.geometry(), rectifier.left_mask(), take.centre_ns)
+        CanvasTruth::trace(&take.world, rectifier.geometry(), rectifier.left_mask(), time_ns)
     }
 }
 

@@ -102,8 +102,7 @@ const GAP_RAD: f64 = 2.2;
 /// # Errors
 /// No face, or no circular edge in it.
 pub fn rim(points_m: &[Point3<f64>], search: &RimSearch) -> Result<Rim, FitError> {
-    let trim = Trim { outliers_max: 0.6, ..Trim::default() };
-    let face = robust::fit::<PlaneFit>(points_m, &trim)?.shape;
+    let face = face(points_m, search)?;
     let axes = Axes::new(&face);
     let on_face: Vec<Point3<f64>> = points_m
         .iter()
@@ -176,6 +175,25 @@ pub fn rim(points_m: &[Point3<f64>], search: &RimSearch) -> Result<Rim, FitError
         });
     }
     Ok(Rim { circle, face, is_hole, spacing_m })
+}
+
+/// Faces that are looked at before giving up.
+const FACES: usize = 5;
+
+/// The face that most points lie on; of those that pass through the place where the circle is about, if
+/// one is given.
+fn face(points_m: &[Point3<f64>], search: &RimSearch) -> Result<PlaneFit, FitError> {
+    let trim = Trim { outliers_max: 0.6, ..Trim::default() };
+    let mut rest: Vec<Point3<f64>> = points_m.to_vec();
+    for _ in 0..FACES {
+        let face = robust::fit::<PlaneFit>(&rest, &trim)?.shape;
+        let passes = |near: Point3<f64>| face.distance_m(&near).abs() <= 3.0 * search.thickness_m;
+        if search.near_m.is_none_or(passes) {
+            return Ok(face);
+        }
+        rest.retain(|p| face.distance_m(p).abs() > search.thickness_m);
+    }
+    Err(FitError::Degenerate { shape: "circle", reason: "no face passes through the place given" })
 }
 
 /// Two axes in a plane.
