@@ -136,9 +136,9 @@ impl Input {
     }
 
     fn source(&self, output: &Output) -> Result<Loaded, Failure> {
-        let source = Source { uri: self.input.clone(), timing: None };
+        let source = Source::new(self.input.clone(), None);
         let mut sensor = source.open()?;
-        let options = stream_options(&self.matching);
+        let options = stream_options(Some(&source), Some(&self.matching));
         let mut stream = sensor.stream_with(&options).map_err(|e| failure(&e))?;
         interrupt::stops(stream.stop_handle());
         let progress = output.progress(self.count as u64, "measuring");
