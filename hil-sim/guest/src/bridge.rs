@@ -4,9 +4,10 @@
 //! end of a socket pair goes to the kernel and two threads copy between the other end and the port.
 
 use crate::{ports, sys};
-use std::fs::File;
 use std::io::{self, Read, Write};
+use std::net::Shutdown;
 use std::os::fd::AsRawFd;
+use std::os::unix::net::UnixStream;
 
 const VHCI: &str = "/sys/devices/platform/vhci_hcd.0";
 
@@ -36,9 +37,11 @@ pub fn attach(name: &str, bus_id: &str) -> io::Result<u32> {
     let line = format!("{rhport} {} {} {speed}", kernel_end.as_raw_fd(), (bus << 16) | device);
     std::fs::write(format!("{VHCI}/attach"), line)
         .map_err(|e| io::Error::other(format!("vhci attach: {e}")))?;
-    let ours = File::from(our_end);
-    copy("to-kernel", port.try_clone()?, ours.try_clone()?)?;
-    copy("from-kernel", ours, port)?;
+    let ours = UnixStream::from(our_end);
+    let (to_kernel, end) = (ours.try_clone()?, ours.try_clone()?);
+    // Unplugged at the far end: the kernel learns it from its socket's end, and the port is free again.
+    copy("to-kernel", port.try_clone()?, to_kernel, move || drop(end.shutdown(Shutdown::Both)))?;
+    copy("from-kernel", ours, port, || {})?;
     Ok(rhport)
 }
 
@@ -64,7 +67,12 @@ fn free_port() -> io::Result<u32> {
         .ok_or_else(|| io::Error::other("no free port at the virtual host controller"))
 }
 
-fn copy(name: &str, mut from: File, mut to: File) -> io::Result<()> {
+fn copy(
+    name: &str,
+    mut from: impl Read + Send + 'static,
+    mut to: impl Write + Send + 'static,
+    finally: impl FnOnce() + Send + 'static,
+) -> io::Result<()> {
     std::thread::Builder::new().name(name.into()).spawn(move || {
         let mut buffer = vec![0; 256 * 1024];
         while let Ok(count @ 1..) = from.read(&mut buffer) {
@@ -72,6 +80,7 @@ fn copy(name: &str, mut from: File, mut to: File) -> io::Result<()> {
                 break;
             }
         }
+        finally();
     })?;
     Ok(())
 }
