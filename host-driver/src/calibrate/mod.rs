@@ -2,7 +2,7 @@
 //!
 //! [`detect`] finds the target points of a [`Board`] in images, [`solve`](solve::solve) turns them
 //! into a calibration with its uncertainty ([`zhang`] starts, [`bundle`] adjusts), [`coverage`] and
-//! [`findings`] say what the images lacked, [`report`] writes it down. [`print`] draws boards.
+//! [`findings`] say what the images lacked, [`report`] writes it down. [`mod@print`] draws boards.
 
 pub mod board;
 pub mod bundle;
