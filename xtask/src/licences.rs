@@ -1,6 +1,6 @@
 //! Licences of everything that ships, against the list in deny.toml.
 
-use crate::workspace::{items, root};
+use crate::workspace::{self, items, root};
 use serde_json::Value;
 use std::collections::{BTreeSet, HashMap};
 
@@ -18,7 +18,7 @@ pub fn check(metadata: &Value) -> Result<String, String> {
         .filter_map(|package| Some((package["id"].as_str()?, package)))
         .collect();
     let mut wrong = Vec::new();
-    let shipped = shipped(metadata);
+    let shipped = shipped(metadata)?;
     for id in &shipped {
         let package = packages.get(id).ok_or_else(|| format!("cargo metadata lacks {id}"))?;
         let (name, version) = (&package["name"], &package["version"]);
@@ -51,30 +51,44 @@ fn allowed() -> Result<BTreeSet<String>, String> {
 }
 
 /// Ids of the crates reachable from ours over normal and build dependencies.
-fn shipped(metadata: &Value) -> BTreeSet<&str> {
-    let nodes: HashMap<&str, &Value> = items(&metadata["resolve"], "nodes")
-        .filter_map(|node| Some((node["id"].as_str()?, node)))
+///
+/// By `cargo tree`, which unites the features of the crates that ship only: `cargo metadata` would
+/// add what the test benches switch on.
+fn shipped(metadata: &Value) -> Result<BTreeSet<&str>, String> {
+    let by_name: HashMap<String, &str> = items(metadata, "packages")
+        .filter_map(|package| {
+            let (name, version) = (package["name"].as_str()?, package["version"].as_str()?);
+            Some((format!("{name} v{version}"), package["id"].as_str()?))
+        })
         .collect();
-    let bench = |id: &str| {
-        items(metadata, "packages")
-            .any(|p| p["id"] == id && NOT_SHIPPED.iter().any(|name| p["name"] == *name))
-    };
-    let mut pending: Vec<&str> = items(metadata, "workspace_members")
-        .filter_map(Value::as_str)
-        .filter(|id| !bench(id))
-        .collect();
-    let mut reached = BTreeSet::new();
-    while let Some(id) = pending.pop() {
-        if !reached.insert(id) {
-            continue;
-        }
-        let Some(node) = nodes.get(id) else { continue };
-        for dependency in items(node, "deps") {
-            let ships = items(dependency, "dep_kinds").any(|kind| kind["kind"] != "dev");
-            if let (true, Some(to)) = (ships, dependency["pkg"].as_str()) {
-                pending.push(to);
-            }
+    let mut tree = workspace::cargo();
+    if let Some(root) = metadata["workspace_root"].as_str() {
+        tree.current_dir(root);
+    }
+    tree.args(["tree", "--locked", "--edges=normal,build", "--target=all"]);
+    tree.args(["--prefix=none", "--no-dedupe", "--format={p}"]);
+    let members: BTreeSet<&str> =
+        items(metadata, "workspace_members").filter_map(Value::as_str).collect();
+    for package in items(metadata, "packages") {
+        let (id, name) = (package["id"].as_str(), package["name"].as_str());
+        if let (Some(id), Some(name)) = (id, name)
+            && members.contains(id)
+            && !NOT_SHIPPED.contains(&name)
+        {
+            tree.arg(format!("--package={id}"));
         }
     }
-    reached
+    let output = tree.output().map_err(|e| format!("cargo tree could not be run: {e}"))?;
+    if !output.status.success() {
+        return Err(format!("cargo tree: {}", String::from_utf8_lossy(&output.stderr).trim()));
+    }
+    String::from_utf8_lossy(&output.stdout)
+        .lines()
+        .filter(|line| !line.is_empty())
+        .map(|line| {
+            let name: Vec<&str> = line.split(' ').take(2).collect();
+            let name = name.join(" ");
+            by_name.get(&name).copied().ok_or_else(|| format!("cargo metadata lacks {name}"))
+        })
+        .collect()
 }
