@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::bench::{Bench, SCENE_SCALE, TIMEOUT_S};
+use super::bench::{Bench, METHOD, SCENE_SCALE, TIMEOUT_S};
 
 /// A scenario's name, and what runs it: what was seen, or what was wrong.
 pub type Scenario = (&'static str, fn(&mut Bench) -> Result<String, String>);
@@ -102,7 +102,11 @@ fn doctor(bench: &mut Bench) -> Result<String, String> {
 /// The longest period there is: the guest's emulated processor moves few pictures a second.
 const PERIOD_US: &str = "65000";
 
-fn set_timing(bench: &mut Bench) -> Result<Value, String> {
+/// Sets the timing of all scenarios.
+///
+/// # Errors
+/// What `stspp` said.
+pub fn set_timing(bench: &mut Bench) -> Result<Value, String> {
     let set =
         ["timing", "set", "--json", "--source", "usb:", "--defaults", "--period-us", PERIOD_US];
     bench.stspp_json(30, &set)
@@ -132,9 +136,10 @@ fn camera_controls(bench: &mut Bench) -> Result<String, String> {
         let json: Value = serde_json::from_str(pair).map_err(|e| format!("{e}: {text}"))?;
         json["mean_grey"][0].as_f64().ok_or_else(|| format!("no grey value: {json}"))
     };
-    let full = bright(bench, "exposure_us=100000&gain=100")?;
     let short = bright(bench, "exposure_us=4000&gain=100")?;
     let gained = bright(bench, "exposure_us=4000&gain=400")?;
+    // Last, because the cameras keep what they are set to.
+    let full = bright(bench, "exposure_us=100000&gain=100")?;
     // The default exposure is 32 ms: an eighth of the light, then four times its numbers.
     let told =
         format!("mean grey {full:.1}, {short:.1} at 1/8 of the exposure, {gained:.1} at gain 4");
@@ -187,6 +192,8 @@ fn depth(bench: &mut Bench) -> Result<String, String> {
         "--json",
         "--timeout",
         "60",
+        "--method",
+        METHOD,
         "--source",
         &source,
         "--out",
@@ -326,25 +333,31 @@ fn ends_with(bench: &mut Bench, command: &str, word: &str) -> Result<String, Str
 
 /// The device is plugged in again by its kernel, its faults are cleared, and it streams.
 fn works_again(bench: &mut Bench, told: String) -> Result<String, String> {
-    bench.plug_in_if_gone("control")?;
+    bench.plug_in_again().map_err(|e| format!("{e}, after {told:?}"))?;
     let source = bench.source();
     bench.stspp_ok(30, &["doctor", "--clear-faults", "--quiet", "--source", &source])?;
+    // A device that restarted has its default timing.
+    set_timing(bench)?;
     stream(bench, "12")?;
     Ok(told)
 }
 
+/// What a host says whose device left the bus, as one does that restarts: by its reset pin, or by the
+/// watchdog after its firmware hung.
+const GONE: &str = "the sensor is gone";
+
 fn reset(bench: &mut Bench) -> Result<String, String> {
-    let told = ends_with(bench, "reset", "")?;
+    let told = ends_with(bench, "reset", GONE)?;
     works_again(bench, told)
 }
 
 fn hang(bench: &mut Bench) -> Result<String, String> {
-    let told = ends_with(bench, "hang", "")?;
+    let told = ends_with(bench, "hang", GONE)?;
     works_again(bench, told)
 }
 
 fn interlock(bench: &mut Bench) -> Result<String, String> {
-    let told = ends_with(bench, "interlock open", "interlock")?;
+    let told = ends_with(bench, "interlock open", "interlock opened")?;
     bench.server.command("interlock closed")?;
     works_again(bench, told)
 }
