@@ -9,6 +9,7 @@ use crate::{
         DenseFit, DenseMaps, mark_steps,
         motion::MotionFit,
         order::{OrderChoice, accept},
+        settle::Settle,
     },
     regions::Regions,
 };
@@ -23,6 +24,7 @@ pub(crate) struct Fast {
     start: Image<f32>,
     step: Image<u8>,
     fit: DenseFit,
+    settle: Settle,
     motion: MotionFit,
     maps: DenseMaps,
     order: OrderChoice,
@@ -40,6 +42,7 @@ impl Fast {
             start: Image::new(0, 0, f32::NAN),
             step: Image::new(0, 0, 0),
             fit: DenseFit::new(level, a.subset_radius, params.shape, a.surface_px),
+            settle: Settle::new(level, a.subset_radius, a.surface_px),
             motion: MotionFit::new(level),
             maps: DenseMaps::new(0, 0),
             order: OrderChoice::default(),
@@ -70,6 +73,10 @@ impl Fast {
         done("search");
         begin(stack, &self.map, &mut self.start);
         self.regions.remove(&mut self.start, self.params.advanced.region_min);
+        let settles = self.params.advanced.settle_steps;
+        if settles {
+            self.settle.begin(stack, &mut self.start);
+        }
         mark_steps(
             self.level,
             &self.start,
@@ -80,6 +87,11 @@ impl Fast {
         done("steps");
         self.fit.fit(stack, &self.start, &self.step, &mut self.maps);
         done("dense");
+        if settles {
+            let Self { settle, fit, start, step, maps, .. } = self;
+            settle.run(stack, self.params.zncc_min, fit, start, step, maps);
+            done("settle");
+        }
         let rate = if self.params.motion {
             let rate =
                 self.motion.run(stack, &mut self.fit, &self.start, &self.step, &mut self.maps);

@@ -99,6 +99,10 @@ pub struct Advanced {
     /// A window pixel belongs to the centre's surface when its coarse disparity is at most this far
     /// from the local fit.
     pub surface_px: f32,
+    /// Whether [`Method::Dense`] lets the pixels' own grey values decide at depth steps, as
+    /// [`Method::IcGn`] always does; from six frames on. On the simulated part 0.1 % of the points are
+    /// then wrong instead of 2.7 %, 1 % fewer are found, and a frame takes half as long again.
+    pub settle_steps: bool,
     /// Interpolation of the right images in IC-GN.
     pub interpolation: Interpolation,
     /// Highest SIMD level to use; the machine's best when `None`.
@@ -120,6 +124,7 @@ impl Default for Advanced {
             uniqueness: 0.02,
             region_min: 60,
             surface_px: 1.5,
+            settle_steps: false,
             interpolation: Interpolation::default(),
             level_max: None,
             threads: None,

@@ -42,15 +42,17 @@ const BYTES_PER_PIXEL: usize = 100;
 
 #[test]
 fn no_memory_is_taken_after_the_first_frame() {
-    for (shape, frames, motion) in [
-        (ShapeFunction::First, 10, false),
-        (ShapeFunction::Auto, 5, false),
-        (ShapeFunction::Auto, 10, true),
+    for (shape, frames, motion, settle) in [
+        (ShapeFunction::First, 10, false, false),
+        (ShapeFunction::Auto, 5, false, false),
+        (ShapeFunction::Auto, 10, true, false),
+        (ShapeFunction::Auto, 10, true, true),
     ] {
         let scene = Scene::benchmark(480, 200, frames, 20.0).render();
         let times: Vec<f64> = (0..frames).map(|k| k as f64 / 30.0).collect();
         let mut params = Params::new(DisparityRange { min_px: -150, max_px: 80 });
         (params.method, params.shape, params.motion) = (Method::Dense, shape, motion);
+        params.advanced.settle_steps = settle;
         // A thread's buffers are made when it first gets work, which with several is chance.
         params.advanced.threads = Some(1);
         let before = HELD.load(Relaxed);

@@ -43,6 +43,8 @@ pub struct Setting {
     pub shape: ShapeFunction,
     /// Threads of the matcher; all cores when `None`.
     pub threads: Option<usize>,
+    /// Whether the dense method settles depth steps by the pixels' own grey values.
+    pub settle_steps: bool,
 }
 
 /// A scene, simulated and rectified, with the truth of its canvas.
@@ -142,6 +144,7 @@ impl Case {
         params.method = setting.method;
         params.shape = setting.shape;
         params.advanced.threads = setting.threads;
+        params.advanced.settle_steps = setting.settle_steps;
         let mut matcher = Matcher::new(params)?;
         let start = std::time::Instant::now();
         let frame = self.stack.depth_frame(&mut matcher, 0..frames)?;

@@ -19,6 +19,7 @@ pub mod motion;
 pub(crate) mod normalise;
 pub mod order;
 pub(crate) mod refit;
+pub mod settle;
 pub(crate) mod solve;
 mod steps;
 pub(crate) mod tile;
@@ -101,17 +102,18 @@ impl DenseFit {
         self.run(stack, start, step, None, out);
     }
 
-    /// Fits anew the blocks that are set in `moving`, with `motion`, and leaves the others as they are.
+    /// Fits anew the blocks that are set in `again`, with `motion` if there is any, and leaves the others
+    /// as they are.
     pub(crate) fn refit(
         &mut self,
         stack: &StereoStack<'_>,
         start: &Image<f32>,
         step: &Image<u8>,
-        motion: &Motion,
-        moving: &Image<bool>,
+        motion: Option<&Motion>,
+        again: &Image<bool>,
         out: &mut DenseMaps,
     ) {
-        self.run(stack, start, step, Some((motion, moving)), out);
+        self.run(stack, start, step, Some((motion, again)), out);
     }
 
     fn run(
@@ -119,7 +121,7 @@ impl DenseFit {
         stack: &StereoStack<'_>,
         start: &Image<f32>,
         step: &Image<u8>,
-        again: Option<(&Motion, &Image<bool>)>,
+        again: Option<(Option<&Motion>, &Image<bool>)>,
         out: &mut DenseMaps,
     ) {
         let (width, height) = (stack.width(), stack.height());
@@ -144,7 +146,7 @@ impl DenseFit {
             fits: if self.shape == ShapeFunction::First { Fits::First } else { Fits::Both },
             surface_px: self.surface_px,
             origin: origin(start),
-            motion: again.map(|(motion, _)| motion),
+            motion: again.and_then(|(motion, _)| motion),
         };
         let tiles = self.tiles.ready();
         // Results do not depend on where bands end.
@@ -163,7 +165,7 @@ impl DenseFit {
             .for_each(|(band, ((first, second), zncc))| {
                 let mut out = Output { first, second, zncc };
                 tiles.with(|tile| {
-                    for (from, to) in columns(width, band, again.map(|(_, moving)| moving)) {
+                    for (from, to) in columns(width, band, again.map(|(_, blocks)| blocks)) {
                         let strips = (to - from).div_ceil(STRIP);
                         for strip in 0..strips {
                             let part = |k: usize| from + (to - from) * k / strips;
@@ -176,14 +178,14 @@ impl DenseFit {
     }
 }
 
-/// Ranges of columns of a band that are to be fitted: all, or those of the blocks set in `moving`.
-fn columns(width: usize, band: usize, moving: Option<&Image<bool>>) -> Vec<(usize, usize)> {
-    let Some(moving) = moving else { return vec![(0, width)] };
+/// Ranges of columns of a band that are to be fitted: all, or those of the blocks set in `again`.
+fn columns(width: usize, band: usize, again: Option<&Image<bool>>) -> Vec<(usize, usize)> {
+    let Some(again) = again else { return vec![(0, width)] };
     let per_band = BAND / BLOCK;
-    let rows = band * per_band..((band + 1) * per_band).min(moving.height());
-    let set = |column: usize| rows.clone().any(|row| moving.row(row)[column]);
+    let rows = band * per_band..((band + 1) * per_band).min(again.height());
+    let set = |column: usize| rows.clone().any(|row| again.row(row)[column]);
     let mut ranges: Vec<(usize, usize)> = Vec::new();
-    for column in (0..moving.width()).filter(|&c| set(c)) {
+    for column in (0..again.width()).filter(|&c| set(c)) {
         let (from, to) = (column * BLOCK, ((column + 1) * BLOCK).min(width));
         match ranges.last_mut() {
             Some(last) if last.1 == from => last.1 = to,

@@ -24,7 +24,7 @@ mod signature;
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, StereoStack, lanes::vectorised};
+use crate::{Image, Level, StereoStack, lanes::vectorised, parallel::PerThread};
 use decide::Judge;
 pub use decide::{FRAMES_MIN, LIGHT_MIN, NEXT_LIGHT_MIN, SIMILARITY_MIN};
 use signature::{Signature, signature};
@@ -69,13 +69,25 @@ pub struct StepJudge {
     near: Image<u8>,
     beside: Image<u8>,
     light: Vec<f32>,
+    /// Pixels to judge in a pass, and what takes their disparity's place.
+    open: Vec<u32>,
+    proposals: Vec<Option<Option<f32>>>,
+    columns: PerThread<Vec<u8>>,
 }
 
 impl StepJudge {
     /// A judge that marks steps with the kernels of `level`.
     pub fn new(level: Level) -> Self {
         let none = || Image::new(0, 0, 0);
-        Self { level: level.usable(), near: none(), beside: none(), light: Vec::new() }
+        Self {
+            level: level.usable(),
+            near: none(),
+            beside: none(),
+            light: Vec::new(),
+            open: Vec::new(),
+            proposals: Vec::new(),
+            columns: PerThread::default(),
+        }
     }
 
     /// Judges the pixels of `disparity_px` (NaN is invalid) beside steps and gaps, changes it where
@@ -106,43 +118,44 @@ impl StepJudge {
         self.mark_beside(stack, disparity_px);
         self.mark_near();
         self.measure_light(stack, disparity_px);
-        let mut open: Vec<u32> = (0..(width * height) as u32)
-            .into_par_iter()
-            .filter(|&i| self.beside.as_slice()[i as usize] != 0)
-            .collect();
+        self.open.clear();
+        let marks = self.beside.as_slice().iter().enumerate();
+        self.open.extend(marks.filter(|(_, b)| **b != 0).map(|(i, _)| i as u32));
         for _ in 0..PASSES {
             let judge = Judge { stack, disparity_px, beside: &self.beside, light: &self.light };
-            let changed: Vec<(u32, Option<f32>)> = open
-                .par_iter()
-                .filter_map(|&i| {
-                    let (x, y) = (i as usize % width, i as usize / width);
-                    judge.pixel(x, y).map(|to| (i, to))
-                })
-                .collect();
-            if changed.is_empty() {
+            self.proposals.resize(self.open.len(), None);
+            self.open.par_iter().zip(&mut self.proposals).with_min_len(64).for_each(|(&i, to)| {
+                *to = judge.pixel(i as usize % width, i as usize / width);
+            });
+            let mut changed = 0;
+            for k in 0..self.open.len() {
+                let Some(to) = self.proposals[k] else { continue };
+                let i = self.open[k] as usize;
+                disparity_px.as_mut_slice()[i] = to.unwrap_or(f32::NAN);
+                verdicts.as_mut_slice()[i] = to.map_or(Verdict::Removed, |_| Verdict::Moved);
+                self.open[changed] = i as u32;
+                changed += 1;
+            }
+            if changed == 0 {
                 break;
             }
-            open.clear();
-            for &(i, to) in &changed {
-                let at = i as usize;
-                disparity_px.as_mut_slice()[at] = to.unwrap_or(f32::NAN);
-                verdicts.as_mut_slice()[at] = to.map_or(Verdict::Removed, |_| Verdict::Moved);
-            }
+            self.open.truncate(changed);
             // What the changed pixels hid is beside a step or a gap now.
-            for &(i, _) in &changed {
-                let (x, y) = (i as usize % width, i as usize / width);
+            for k in 0..changed {
+                let (x, y) = (self.open[k] as usize % width, self.open[k] as usize / width);
                 for (nx, ny) in around(x, y, width, height) {
                     let n = ny * width + nx;
                     if verdicts.as_slice()[n] == Verdict::Kept
                         && self.is_beside(disparity_px, nx, ny)
                     {
                         self.beside.as_mut_slice()[n] = 1;
-                        open.push(n as u32);
+                        self.open.push(n as u32);
                     }
                 }
             }
-            open.sort_unstable();
-            open.dedup();
+            self.open.drain(..changed);
+            self.open.sort_unstable();
+            self.open.dedup();
         }
     }
 
@@ -182,18 +195,18 @@ impl StepJudge {
     /// Marks all pixels within [`NEAR_RADIUS`] of those beside steps.
     fn mark_near(&mut self) {
         let (width, height) = (self.beside.width(), self.beside.height());
-        let (level, beside) = (self.level, &self.beside);
-        self.near.as_mut_slice().par_chunks_mut(width).enumerate().for_each_init(
-            || vec![0u8; width + 2 * NEAR_RADIUS],
-            |column, (y, out)| {
-                column.fill(0);
+        let (level, beside, columns) = (self.level, &self.beside, self.columns.ready());
+        self.near.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, out)| {
+            columns.with(|column| {
+                column.clear();
+                column.resize(width + 2 * NEAR_RADIUS, 0);
                 for row in y.saturating_sub(NEAR_RADIUS)..(y + NEAR_RADIUS + 1).min(height) {
                     let marks = column[NEAR_RADIUS..].iter_mut().zip(beside.row(row));
                     marks.for_each(|(c, b)| *c |= b);
                 }
                 vectorised!(level, widen(column: &[u8] = column, out: &mut [u8] = out));
-            },
-        );
+            });
+        });
     }
 
     fn is_beside(&self, disparity_px: &Image<f32>, x: usize, y: usize) -> bool {

@@ -203,7 +203,7 @@ impl MotionFit {
         self.rates.expand(&self.blocks, &maps.first_px, &mut self.motion.rate);
         self.motion.offsets = times.to_newest;
         self.begin(start, maps, &times);
-        fit.refit(stack, &self.start, step, &self.motion, &self.rates.moving(), maps);
+        fit.refit(stack, &self.start, step, Some(&self.motion), &self.rates.moving(), maps);
 
         let best = if both { &maps.second_px } else { &maps.first_px };
         self.blocks.sum(&frame.of(best, &maps.zncc, None), Some(&self.motion));
