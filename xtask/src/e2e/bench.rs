@@ -22,6 +22,12 @@ pub const TIMEOUT_S: &str = "20";
 /// per-point IC-GN takes minutes on an emulated processor.
 pub const METHOD: &str = "dense";
 
+/// Depth frames that are held against the truth: the RMS of one varies by two per cent.
+pub const DEPTH_FRAMES: &str = "3";
+
+/// It is dark when no light was seen for so long: between two exposures there is none either.
+const DARK: Duration = Duration::from_millis(400);
+
 /// Where the guest finds the cameras' calibration.
 pub const CALIBRATION: &str = "etc/stspp/camchain.yaml";
 
@@ -48,10 +54,20 @@ pub struct Bench {
 /// How a cloud compares with the truth.
 #[derive(Debug, Clone, Copy)]
 pub struct Score {
-    /// Points.
+    /// Points of a frame.
     pub points: u64,
-    /// RMS of the errors within 5 mm.
+    /// RMS of a frame's errors within 5 mm.
     pub rms_mm: f64,
+}
+
+impl Score {
+    fn mean(scores: &[Self]) -> Self {
+        let count = scores.len().max(1);
+        Self {
+            points: scores.iter().map(|s| s.points).sum::<u64>() / count as u64,
+            rms_mm: scores.iter().map(|s| s.rms_mm).sum::<f64>() / count as f64,
+        }
+    }
 }
 
 impl Bench {
@@ -221,12 +237,31 @@ impl Bench {
         let _ = super::scenario::set_timing(self);
     }
 
+    /// Waits until nothing is lit any more; how long it took.
+    ///
+    /// # Errors
+    /// When there is light for five seconds.
+    pub fn wait_dark(&self) -> Result<Duration, String> {
+        let begun = Instant::now();
+        let mut lit_at = begun;
+        while lit_at.elapsed() < DARK {
+            if self.server.is_lit()? {
+                lit_at = Instant::now();
+            }
+            if lit_at - begun > Duration::from_secs(5) {
+                return Err("the light stays on".into());
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        Ok(lit_at - begun)
+    }
+
     /// Checks that nothing is lit.
     ///
     /// # Errors
     /// When something is.
     pub fn dark(&self) -> Result<(), String> {
-        if self.server.is_lit()? { Err("light after the end".into()) } else { Ok(()) }
+        if self.wait_dark()?.is_zero() { Ok(()) } else { Err("light after the end".into()) }
     }
 
     /// A request while a program runs.
@@ -246,14 +281,19 @@ impl Bench {
         if reply.code == 0 { Ok(reply.bytes) } else { Err(format!("{path}: {}", reply.text())) }
     }
 
-    /// Compares a cloud with the scene.
+    /// Compares the clouds that the guest has captured into `folder` with the scene.
     ///
     /// # Errors
-    /// When the comparison fails.
-    pub fn score(&self, name: &str, cloud: &[u8]) -> Result<Score, String> {
-        let path = self.folder.join(format!("{name}.ply"));
-        std::fs::write(&path, cloud).map_err(|e| format!("{}: {e}", path.display()))?;
-        self.score_file(&path)
+    /// When one is not there, or the comparison fails.
+    pub fn score(&mut self, folder: &str) -> Result<Score, String> {
+        let mut scores = Vec::new();
+        for name in cloud_names() {
+            let cloud = self.file(&format!("{folder}/{name}"))?;
+            let path = self.folder.join("guest.ply");
+            std::fs::write(&path, cloud).map_err(|e| format!("{}: {e}", path.display()))?;
+            scores.push(self.score_file(&path)?);
+        }
+        Ok(Score::mean(&scores))
     }
 
     fn score_file(&self, path: &Path) -> Result<Score, String> {
@@ -280,7 +320,16 @@ impl Bench {
         }
         let out = self.folder.join("in-process");
         let status = Command::new(&self.stspp)
-            .args(["capture", "--quiet", "--force", "--method", METHOD, "--source"])
+            .args([
+                "capture",
+                "--quiet",
+                "--force",
+                "--method",
+                METHOD,
+                "-n",
+                DEPTH_FRAMES,
+                "--source",
+            ])
             .args([&scene_uri(), "--out"])
             .arg(&out)
             .stdout(std::process::Stdio::null())
@@ -288,10 +337,17 @@ impl Bench {
         if !status.is_ok_and(|s| s.success()) {
             return Err("the capture in process failed".into());
         }
-        let score = self.score_file(&out.join("cloud.ply"))?;
+        let scores: Result<Vec<Score>, String> =
+            cloud_names().map(|name| self.score_file(&out.join(name))).collect();
+        let score = Score::mean(&scores?);
         self.in_process = Some(score);
         Ok(score)
     }
+}
+
+/// Where [`DEPTH_FRAMES`] captured frames have their clouds.
+fn cloud_names() -> impl Iterator<Item = String> {
+    (0..DEPTH_FRAMES.parse().unwrap_or(1)).map(|k: u32| format!("{k:04}/cloud.ply"))
 }
 
 /// The scene as a source of the in-process simulator.

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::bench::{Bench, METHOD, SCENE_SCALE, TIMEOUT_S};
+use super::bench::{Bench, DEPTH_FRAMES, METHOD, SCENE_SCALE, TIMEOUT_S};
 
 /// A scenario's name, and what runs it: what was seen, or what was wrong.
 pub type Scenario = (&'static str, fn(&mut Bench) -> Result<String, String>);
@@ -194,18 +194,19 @@ fn depth(bench: &mut Bench) -> Result<String, String> {
         "60",
         "--method",
         METHOD,
+        "-n",
+        DEPTH_FRAMES,
         "--source",
         &source,
         "--out",
         "/tmp/depth",
     ];
     bench.stspp_ok(150, &arguments)?;
-    let cloud = bench.file("/tmp/depth/cloud.ply")?;
-    let guest = bench.score("guest", &cloud)?;
+    let guest = bench.score("/tmp/depth")?;
     let host = bench.in_process_score()?;
     let ratio = guest.rms_mm / host.rms_mm;
     let told = format!(
-        "RMS {:.4} mm, in-process {:.4} mm ({:+.1} %), {} and {} points at 1/{SCENE_SCALE} scale",
+        "mean RMS of {DEPTH_FRAMES} {:.4} mm, in-process {:.4} mm ({:+.1} %), {} and {} points at 1/{SCENE_SCALE} scale",
         guest.rms_mm,
         host.rms_mm,
         100.0 * (ratio - 1.0),
@@ -291,15 +292,7 @@ fn unplug(bench: &mut Bench, device: &str) -> Result<String, String> {
     bench.wait_lit()?;
     std::thread::sleep(Duration::from_millis(1500));
     bench.server.command(&format!("unplug {device}"))?;
-    let begun = Instant::now();
-    while bench.server.is_lit()? {
-        if begun.elapsed() > Duration::from_secs(5) {
-            return Err("the light stays on".into());
-        }
-        std::thread::sleep(Duration::from_millis(20));
-    }
-    let dark_ms = begun.elapsed().as_millis();
-    std::thread::sleep(Duration::from_millis(500));
+    let dark_ms = bench.wait_dark()?.as_millis();
     bench.server.command(&format!("plug {device}"))?;
     bench.plug_in(device)?;
     bench.finish_stream()?;
