@@ -18,7 +18,6 @@ mod machine;
 mod scenario;
 mod server;
 
-use crate::stage::{self, Outcome};
 use crate::{debian, firmware, workspace};
 use bench::{Bench, CALIBRATION, DEVICES, SCENE_SCALE, built};
 use std::path::{Path, PathBuf};
@@ -30,17 +29,6 @@ const PACKAGES: &[&str] = &["qemu-system-x86", "kmod", "xz-utils"];
 
 /// No further scenario is begun after this long: what is not compiling ends within six minutes.
 const TIME_LIMIT: Duration = Duration::from_secs(330);
-
-/// All scenarios as a stage of the test command; left out where their Debian packages cannot be had.
-pub fn stage() -> Outcome {
-    if let Err(why) = debian::ensure(PACKAGES).and_then(|()| kernel::prepare().map(drop)) {
-        return Outcome::Skipped(why);
-    }
-    if !firmware::images_are_there() {
-        return Outcome::Skipped("there is no firmware to run: see its stage".into());
-    }
-    stage::check(run(None))
-}
 
 /// A scenario that was run.
 struct Tried {
