@@ -71,7 +71,7 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
         Row::error_mm(
             "RMS, dense least squares, order by pixel",
             Some(0.3324),
-            of_fast.surface_rms_mm,
+            rms_mm(&fast),
         )
         .note(completeness(&of_fast)),
     );
