@@ -68,12 +68,8 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
         .note(completeness(&of_dic)),
     );
     section.rows.push(
-        Row::error_mm(
-            "RMS, dense least squares, order by pixel",
-            Some(0.3324),
-            rms_mm(&fast),
-        )
-        .note(completeness(&of_fast)),
+        Row::error_mm("RMS, dense least squares, order by pixel", Some(0.3324), rms_mm(&fast))
+            .note(completeness(&of_fast)),
     );
     let valid = all.zncc.as_slice().iter().filter(|z| !z.is_nan()).count();
     let similar = all.zncc.as_slice().iter().filter(|z| **z > 0.8).count();

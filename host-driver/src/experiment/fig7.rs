@@ -124,7 +124,7 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
         good: Good::Neither,
         digits: 0,
         note: format!(
-            "as in the paper too small for the camera's 0.45 mm a pixel: {}",
+            "left out above as in the paper, which finds them too small to measure; 7 pixels in radius here: {}",
             lost.join("; ")
         ),
     });

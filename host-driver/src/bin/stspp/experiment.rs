@@ -28,7 +28,7 @@ pub struct Args {
     /// Seed of the simulated sensor: other dots, tolerances and noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Sub-pixel method [default: each figure's own, icgn for 2 to 4, dense for 5 to 8].
+    /// Sub-pixel method [default: each figure's own, icgn for 2, 3, 4 and 7, dense for 5, 6 and 8].
     #[arg(long, value_enum)]
     method: Option<MethodName>,
     /// Order of the subset's shape function [default: each figure's own].
