@@ -13,8 +13,8 @@
 //!
 //! summed over a wide window, since v is smooth. The steps:
 //!
-//! 1. [`sums`]: the sums above per block of 16 x 16 pixels, from every fourth row;
-//! 2. [`rates`]: a plane through the rates of the blocks around that move alike, its significance, and
+//! 1. `sums`: the sums above per block of 16 x 16 pixels, from every fourth row;
+//! 2. `rates`: a plane through the rates of the blocks around that move alike, its significance, and
 //!    from both the rate per pixel. Without significant motion nothing more is done, and the rate is
 //!    zero: a scene at rest pays neither noise nor much time;
 //! 3. where there is motion: the sums again with each frame warped at its own place, then the fit
