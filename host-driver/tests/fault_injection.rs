@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
-use live::Witness;
+use live::{Dice, Witness};
 use stspp::camera::{CameraError, CameraFrame, CameraSource};
 use stspp::clock::Clock;
 use stspp::sim::{SimOptions, SimSensor};
@@ -25,17 +25,6 @@ const SCENE: &str = "sim:plane?scale=16";
 
 /// Times that each fault is injected.
 const TIMES: u64 = 20;
-
-/// A small random generator: the same faults every time.
-struct Dice(u64);
-
-impl Dice {
-    fn roll(&mut self, sides: u64) -> u64 {
-        self.0 =
-            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) % sides
-    }
-}
 
 /// A controller that the test can reach while the rig has it.
 #[derive(Clone)]

@@ -6,7 +6,7 @@ mod live;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use live::{Bench, Witness};
+use live::{Bench, Dice, Witness};
 use stspp::camera::CameraFrame;
 use stspp::error::{Missing, Timeout};
 use stspp::sync::Side;
@@ -16,17 +16,6 @@ use stspp_protocol::reply::DeviceState;
 
 const SCENE: &str = "sim:plane?scale=16";
 const PERIOD_NS: u64 = 33_333_000;
-
-/// A small random generator: the same faults every time.
-struct Dice(u64);
-
-impl Dice {
-    fn roll(&mut self, sides: u64) -> u64 {
-        self.0 =
-            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) % sides
-    }
-}
 
 #[test]
 fn disturbed_streams_deliver_no_wrong_pair_and_account_for_every_frame() {

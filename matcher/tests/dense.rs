@@ -23,6 +23,16 @@ fn run(scene: &Rendered, params: Params) -> Matched {
     scene.with_stack(|stack| matcher.match_stack(stack)).unwrap()
 }
 
+/// Coarse maps of the cheap search and of brute force.
+fn searched(stack: &StereoStack<'_>, range: DisparityRange) -> (CoarseMap, CoarseMap) {
+    let mut coarse = Coarse::new(Level::best(), range);
+    coarse.describe(stack);
+    let (mut cheap, mut all) = (CoarseMap::new(0, 0), CoarseMap::new(0, 0));
+    coarse.search(stack, false, &mut cheap);
+    coarse.search_all(stack, &mut all);
+    (cheap, all)
+}
+
 /// Errors where the map is valid and at least `margin` px inside, 40 more on the left: there the
 /// right image ends.
 fn errors(map: &Image<f32>, truth: &Image<f32>, margin: usize) -> Vec<f64> {
@@ -177,11 +187,7 @@ fn coarse_search_finds_what_brute_force_finds() {
         scene.peak_dn = 40.0;
         let scene = scene.render();
         scene.with_stack(|stack| {
-            let mut coarse = Coarse::new(Level::best(), range);
-            coarse.describe(stack);
-            let (mut cheap, mut all) = (CoarseMap::new(0, 0), CoarseMap::new(0, 0));
-            coarse.search(stack, false, &mut cheap);
-            coarse.search_all(stack, &mut all);
+            let (cheap, all) = searched(stack, range);
             let good = |map: &CoarseMap| {
                 let triples = map.disparity.as_slice().iter().zip(scene.truth_px.as_slice());
                 let near = |(d, t): (&i16, &f32)| *d != INVALID && (f32::from(*d) - t).abs() < 1.5;
@@ -217,11 +223,7 @@ fn thin_objects_are_found_nearly_as_often_as_by_brute_force() {
         scene.peak_dn = 30.0;
         let scene = scene.render();
         scene.with_stack(|stack| {
-            let mut coarse = Coarse::new(Level::best(), range);
-            coarse.describe(stack);
-            let (mut cheap, mut all) = (CoarseMap::new(0, 0), CoarseMap::new(0, 0));
-            coarse.search(stack, false, &mut cheap);
-            coarse.search_all(stack, &mut all);
+            let (cheap, all) = searched(stack, range);
             let good = |map: &CoarseMap| {
                 let on = |x: usize, y: usize| {
                     let (x, y) = (x as f64, y as f64);

@@ -128,14 +128,10 @@ impl ControlFunction {
     }
 
     fn standard(&mut self, setup: Setup) -> Answer<Vec<u8>> {
-        const GET_STATUS: u8 = 0;
-        const CLEAR_FEATURE: u8 = 1;
-        const SET_FEATURE: u8 = 3;
-        const GET_DESCRIPTOR: u8 = 6;
-        const GET_CONFIGURATION: u8 = 8;
-        const SET_CONFIGURATION: u8 = 9;
-        const GET_INTERFACE: u8 = 10;
-        const SET_INTERFACE: u8 = 11;
+        use super::usb::request::{
+            CLEAR_FEATURE, GET_CONFIGURATION, GET_DESCRIPTOR, GET_INTERFACE, GET_STATUS,
+            SET_CONFIGURATION, SET_FEATURE, SET_INTERFACE,
+        };
         let of_endpoint = (setup.recipient() == 2)
             .then(|| ENDPOINTS.iter().position(|known| u16::from(*known) == setup.index))
             .flatten();

@@ -170,3 +170,15 @@ pub trait UsbFunction: Send {
     /// The host has let go of the device: unplugged, as far as the device can tell.
     fn detach(&mut self) {}
 }
+
+/// Numbers of the standard requests (USB 2.0, table 9-4).
+pub(super) mod request {
+    pub const GET_STATUS: u8 = 0;
+    pub const CLEAR_FEATURE: u8 = 1;
+    pub const SET_FEATURE: u8 = 3;
+    pub const GET_DESCRIPTOR: u8 = 6;
+    pub const GET_CONFIGURATION: u8 = 8;
+    pub const SET_CONFIGURATION: u8 = 9;
+    pub const GET_INTERFACE: u8 = 10;
+    pub const SET_INTERFACE: u8 = 11;
+}

@@ -26,6 +26,21 @@ pub struct Chart {
     pub series: Vec<Series>,
 }
 
+impl Chart {
+    /// RMS in mm over the number of patterns, ours and the paper's.
+    pub fn over_patterns(title: &str, ours: Vec<(f64, f64)>, paper: Vec<(f64, f64)>) -> Self {
+        Self {
+            title: title.into(),
+            x: "patterns".into(),
+            y: "RMS, mm".into(),
+            series: vec![
+                Series { name: "ours".into(), points: ours, joined: true },
+                Series { name: "paper".into(), points: paper, joined: false },
+            ],
+        }
+    }
+}
+
 const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 360.0;
 /// Left, top, right and bottom of the plot.

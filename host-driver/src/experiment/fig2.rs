@@ -1,6 +1,6 @@
 //! Figure 2: a plane and a sphere, over the number of patterns.
 
-use super::{Chart, ExperimentError, Figure, Good, Row, Section, Series, Studio, pictures};
+use super::{Chart, ExperimentError, Figure, Good, Row, Section, Studio, pictures};
 use crate::accuracy::score::{score, sphere_rms_mm};
 
 /// Radius of the sphere, metres.
@@ -69,14 +69,10 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
             section.pictures.insert(1, pictures::depth(&frame, "Depth, ten patterns")?);
         }
     }
-    section.charts.push(Chart {
-        title: "Sphere fit over the number of patterns".into(),
-        x: "patterns".into(),
-        y: "RMS, mm".into(),
-        series: vec![
-            Series { name: "ours".into(), points: ours, joined: true },
-            Series { name: "paper".into(), points: paper, joined: false },
-        ],
-    });
+    section.charts.push(Chart::over_patterns(
+        "Sphere fit over the number of patterns",
+        ours,
+        paper,
+    ));
     Ok(section)
 }

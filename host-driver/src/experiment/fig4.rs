@@ -1,7 +1,7 @@
 //! Figure 4: the statue over the number of patterns.
 
 use super::fig6::{surface_of, surface_rms_mm};
-use super::{Chart, ExperimentError, Figure, Good, Row, Section, Series, Studio, pictures};
+use super::{Chart, ExperimentError, Figure, Good, Row, Section, Studio, pictures};
 use crate::DepthFrame;
 use crate::accuracy::score::score;
 
@@ -59,14 +59,6 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
             )?);
         }
     }
-    section.charts.push(Chart {
-        title: "Statue over the number of patterns".into(),
-        x: "patterns".into(),
-        y: "RMS, mm".into(),
-        series: vec![
-            Series { name: "ours".into(), points: ours, joined: true },
-            Series { name: "paper".into(), points: paper, joined: false },
-        ],
-    });
+    section.charts.push(Chart::over_patterns("Statue over the number of patterns", ours, paper));
     Ok(section)
 }

@@ -12,6 +12,18 @@ use stspp::sync::Side;
 use stspp::transport::{Transport, TransportError};
 use stspp::{RawImage, Sensor, SourceUri, StreamOptions};
 
+/// A small random generator: the same faults every time.
+pub struct Dice(pub u64);
+
+impl Dice {
+    /// A number below `sides`.
+    pub fn roll(&mut self, sides: u64) -> u64 {
+        self.0 =
+            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 33) % sides
+    }
+}
+
 /// What happens to a camera frame on its way.
 pub type Tamper = Box<dyn FnMut(CameraFrame) -> Vec<CameraFrame> + Send>;
 

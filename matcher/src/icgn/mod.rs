@@ -95,18 +95,26 @@ impl<'a> Refiner<'a> {
         start: Shape,
         part: &mut Window,
     ) -> Option<Refined> {
-        self.guesser.select_near(map, self.prepared, (x, y), &start, part);
-        if part.count() < 2 * self.guesser.radius() + 1 {
-            return None;
-        }
-        let refined = self.refine(part, x, y, start)?;
-        let near = (refined.shape.0[0] - start.0[0]).abs() <= GROWTH_STEP_PX;
-        (near && self.belongs(map, x, y, &refined, part)).then_some(refined)
+        let refined = self.near(map, x, y, start, part)?;
+        self.belongs(map, x, y, &refined, part).then_some(refined)
     }
 
     /// Refines the point (x, y) at a depth step once more, over the pixels that `map` has on its
     /// surface.
     fn refit(
+        &self,
+        map: &CoarseMap,
+        x: usize,
+        y: usize,
+        start: Shape,
+        part: &mut Window,
+    ) -> Option<Refined> {
+        self.near(map, x, y, start, part).filter(|refined| refined.zncc >= self.zncc_min)
+    }
+
+    /// Refines the point (x, y) from `start` over the pixels that `map` has on that surface; none when
+    /// they are too few or the result is elsewhere.
+    fn near(
         &self,
         map: &CoarseMap,
         x: usize,
@@ -120,7 +128,7 @@ impl<'a> Refiner<'a> {
         }
         let refined = self.refine(part, x, y, start)?;
         let near = (refined.shape.0[0] - start.0[0]).abs() <= GROWTH_STEP_PX;
-        (near && refined.zncc >= self.zncc_min).then_some(refined)
+        near.then_some(refined)
     }
 
     /// The first-order estimate of a point whose second-order one is `shape`, where the whole square
