@@ -81,7 +81,7 @@ const COMMIT: [u8; 8] = [0x21, 1, 0, 2, 1, 0, 34, 0];
 fn devices_are_listed_and_lent_once() {
     let bench = Bench::new();
     let mut host = Host::connect(bench.port);
-    host.stream.write_all(&[1, 0x11, 0x80, 0x05, 0, 0, 0, 0]).unwrap();
+    host.0.stream.write_all(&[1, 0x11, 0x80, 0x05, 0, 0, 0, 0]).unwrap();
     let listing = host.bytes(12);
     assert_eq!(listing[8..], [0, 0, 0, 1]);
     let record = host.bytes(312 + 8);
@@ -131,7 +131,7 @@ fn a_frame_arrives_whole_and_settings_show_in_it() {
     *bench.frames.lock().unwrap() = 1;
     let mut received = Vec::new();
     for i in 0..count {
-        let (_, _, (status, data)) = host.reply(true);
+        let (_, _, (status, data)) = host.reply();
         assert_eq!(status, 0);
         assert_eq!(data.len() < BUFFER, i == count - 1);
         received.extend(data);
@@ -154,10 +154,10 @@ fn a_waiting_transfer_can_be_given_up_and_blocks_nothing() {
     // Nothing to send yet, but control transfers go on.
     assert_eq!(host.control([0x80, 8, 0, 0, 0, 0, 1, 0], &[]), (0, vec![1]));
     let unlink = host.unlink(waiting);
-    assert_eq!(host.reply(false), (4, unlink, (-104, vec![])));
+    assert_eq!(host.reply(), (4, unlink, (-104, vec![])));
     // An endpoint that is not there stalls.
     let stalled = host.send(true, 3, 64, [0; 8], &[]);
-    assert_eq!(host.reply(true), (3, stalled, (-32, vec![])));
+    assert_eq!(host.reply(), (3, stalled, (-32, vec![])));
 }
 
 #[test]
@@ -172,7 +172,7 @@ fn noise_instead_of_usbip_ends_the_connection_only() {
                 (state >> 24) as u8
             })
             .collect();
-        let _ = host.stream.write_all(&noise);
+        let _ = host.0.stream.write_all(&noise);
     }
     assert!(Host::connect(bench.port).import("1-1").is_some());
 }

@@ -160,7 +160,10 @@ impl fmt::Display for Missing {
                 f,
                 "no reply to {request}: the control link is silent; check cable and power"
             ),
-            Self::Trigger => f.write_str("no trigger: the device answers but triggers no camera"),
+            Self::Trigger => f.write_str(
+                "no trigger: the device answers but triggers no camera (with an external trigger: no \
+                 edge comes)",
+            ),
             Self::Exposure => f.write_str(
                 "no exposure: the device triggers but neither camera delivers; check the trigger \
                  cables and the cameras' trigger mode",

@@ -5,6 +5,7 @@
 //!   code; a program that takes longer is killed (code 124)
 //! * `attach PORT BUSID`, `detach N`: see [`crate::bridge`]
 //! * `read FILE`: the file's bytes
+//! * `write FILE TEXT`: the file, its lines apart by the record separator (0x1e)
 //! * `clock SECONDS`: sets the clock
 //! * `poweroff`
 //!
@@ -13,6 +14,7 @@
 use crate::{bridge, ports, sys};
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read, Write};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -36,6 +38,7 @@ pub fn serve(name: &str) -> io::Result<()> {
             }
             ["detach", n] => bridge::detach(n.parse().unwrap_or(0)),
             ["read", file] => std::fs::read(file).and_then(|bytes| say(&answer, &bytes)),
+            ["write", file, text] => write(file.as_ref(), &text.replace('\x1e', "\n")),
             ["clock", seconds] => sys::set_clock(seconds.parse().unwrap_or(0)),
             ["poweroff"] => return finish(&answer, 0),
             _ => Err(io::Error::other("unknown request")),
@@ -52,6 +55,11 @@ pub fn serve(name: &str) -> io::Result<()> {
         }
     }
     Ok(())
+}
+
+fn write(file: &Path, text: &str) -> io::Result<()> {
+    file.parent().map_or(Ok(()), std::fs::create_dir_all)?;
+    std::fs::write(file, text)
 }
 
 /// A program ended with this code.

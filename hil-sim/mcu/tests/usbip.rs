@@ -225,7 +225,7 @@ fn waiting_transfers_are_given_up_refused_requests_stall_and_a_pulled_cable_ends
     // Replies are wanted no more; what comes then is there for the next one who asks.
     let unlink = driver.host.unlink(driver.waiting[0]);
     loop {
-        let (kind, answered, (status, data)) = driver.host.reply(true);
+        let (kind, answered, (status, data)) = driver.host.reply();
         if kind == 4 {
             assert_eq!((answered, status), (unlink, -104));
             break;
@@ -241,7 +241,7 @@ fn waiting_transfers_are_given_up_refused_requests_stall_and_a_pulled_cable_ends
     // A vendor request that the device does not know, an endpoint that it does not have.
     let refused = driver.host.send(true, 0, 4, [0xc0, 0x55, 0, 0, 0, 0, 4, 0], &[]);
     let answer = loop {
-        let (_, answered, reply) = driver.host.reply(true);
+        let (_, answered, reply) = driver.host.reply();
         if answered == refused {
             break reply;
         }
@@ -252,7 +252,7 @@ fn waiting_transfers_are_given_up_refused_requests_stall_and_a_pulled_cable_ends
     // The cable is pulled: the connection ends, and there is nothing to import.
     bench.controller.set_link_connected(false);
     let mut byte = [0; 4096];
-    while std::io::Read::read(&mut driver.host.stream, &mut byte).unwrap() > 0 {}
+    while std::io::Read::read(&mut driver.host.0.stream, &mut byte).unwrap() > 0 {}
     assert!(Driver::attach(bench.port).is_none(), "unplugged");
     bench.controller.set_link_connected(true);
     let mut again = (0..50)

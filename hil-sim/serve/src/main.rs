@@ -1,8 +1,10 @@
 //! `hil-sim serve --usbip`: the simulated sensor as USB devices that a Linux machine attaches.
 //!
 //! [`sensor`] puts controller, light, cameras and USB devices together; [`pace`] says how fast its time
-//! passes; [`console`] lets its user pull cables and inject faults; [`calibration`] writes what a host needs to know of the cameras.
+//! passes; [`console`] lets its user pull cables and inject faults; [`calibration`] writes what a host
+//! needs to know of the cameras; [`bench`](mod@bench) measures the server.
 
+mod bench;
 mod calibration;
 mod console;
 mod pace;
@@ -27,6 +29,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Verb {
     Serve(Serve),
+    Bench(bench::Args),
 }
 
 /// Offer the sensor to a Linux machine as USB devices: `modprobe vhci-hcd`, then `usbip attach -r HOST
@@ -41,6 +44,16 @@ pub struct Serve {
     /// Address to listen at; port 0 takes a free one.
     #[arg(long, default_value = "127.0.0.1:3240", value_name = "ADDRESS:PORT")]
     listen: String,
+    #[command(flatten)]
+    simulated: Simulated,
+    /// Write the cameras' calibration (camchain.yaml) here and go on.
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
+}
+
+/// The sensor and what is before it.
+#[derive(clap::Args)]
+pub struct Simulated {
     /// Scene before the cameras: a name of `stspp list --scenes` or a mesh file, with
     /// `?OPTION=VALUE&...`.
     #[arg(long, default_value = "sphere")]
@@ -64,9 +77,6 @@ pub struct Serve {
     /// lost on a machine that is too slow, such as an emulated one.
     #[arg(long)]
     patient: bool,
-    /// Write the cameras' calibration (camchain.yaml) here and go on.
-    #[arg(long, value_name = "FILE")]
-    calibration: Option<PathBuf>,
 }
 
 /// What runs the simulated controller.
@@ -79,8 +89,11 @@ pub enum Mcu {
 }
 
 fn main() -> ExitCode {
-    let Verb::Serve(serve) = Cli::parse().verb;
-    match run(&serve) {
+    let result = match Cli::parse().verb {
+        Verb::Serve(serve) => run(&serve),
+        Verb::Bench(args) => bench::run(&args),
+    };
+    match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error}");
@@ -93,12 +106,12 @@ fn run(serve: &Serve) -> Result<(), Box<dyn std::error::Error>> {
     let listener = TcpListener::bind(&serve.listen)
         .map_err(|error| format!("{}: {error}; choose another port by --listen", serve.listen))?;
     let address = listener.local_addr()?;
-    let sensor = sensor::Sensor::new(serve)?;
+    let sensor = sensor::Sensor::new(&serve.simulated)?;
     if let Some(path) = &serve.calibration {
         let text = calibration::to_text(sensor.world().model());
         std::fs::write(path, text).map_err(|error| format!("{}: {error}", path.display()))?;
     }
-    eprintln!("rendering {} as each light shows it", serve.scene);
+    eprintln!("rendering {} as each light shows it", serve.simulated.scene);
     sensor.prepare();
     let (server, console) = sensor.into_server();
     // The first line of the output is for programs.

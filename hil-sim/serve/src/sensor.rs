@@ -22,7 +22,7 @@ use stspp_protocol::usb as ids;
 
 use crate::console::{Chip, Console};
 use crate::pace::{self, Backlog};
-use crate::{Mcu, Serve};
+use crate::{Mcu, Simulated};
 
 /// Exposures that a camera keeps for a host that is slow: a few, as cameras do.
 const FRAMES_KEPT: usize = 8;
@@ -52,19 +52,20 @@ impl Sensor {
     ///
     /// # Errors
     /// A scene that cannot be, or a firmware that does not start.
-    pub fn new(serve: &Serve) -> Result<Self, Box<dyn std::error::Error>> {
-        let (name, options) = serve.scene.split_once('?').unwrap_or((&serve.scene, ""));
+    pub fn new(simulated: &Simulated) -> Result<Self, Box<dyn std::error::Error>> {
+        let (name, options) = simulated.scene.split_once('?').unwrap_or((&simulated.scene, ""));
         let options: Vec<(&str, &str)> =
             options.split('&').filter_map(|option| option.split_once('=')).collect();
-        if !matches!(serve.scale, 1 | 2 | 4 | 8 | 16) || !matches!(serve.bits, 8 | 10 | 12) {
+        if !matches!(simulated.scale, 1 | 2 | 4 | 8 | 16) || !matches!(simulated.bits, 8 | 10 | 12)
+        {
             return Err("--scale is 1, 2, 4, 8 or 16, and --bits 8, 10 or 12".into());
         }
-        let model = SensorModel::with_seed(serve.seed).with_bits(serve.bits);
-        let model = if serve.scale > 1 { model.scaled_down(serve.scale) } else { model };
+        let model = SensorModel::with_seed(simulated.seed).with_bits(simulated.bits);
+        let model = if simulated.scale > 1 { model.scaled_down(simulated.scale) } else { model };
         let world = Arc::new(World::new(&SceneSpec::parse(name, &options)?, model)?);
-        let (control, booted_ns) = control(serve)?;
+        let (control, booted_ns) = control(simulated)?;
         let backlog = Backlog::default();
-        let clock = pace::clock(booted_ns, serve.patient, Arc::clone(&backlog));
+        let clock = pace::clock(booted_ns, simulated.patient, Arc::clone(&backlog));
         let control = match control {
             Unclocked::Emulated(controller) => {
                 let (shared, port) =
@@ -155,13 +156,13 @@ enum Unclocked {
     InProcess(Box<InProcess>, String),
 }
 
-fn control(serve: &Serve) -> Result<(Unclocked, u64), Box<dyn std::error::Error>> {
-    if serve.mcu == Mcu::None {
-        let options = InProcessOptions::seeded(serve.seed);
+fn control(simulated: &Simulated) -> Result<(Unclocked, u64), Box<dyn std::error::Error>> {
+    if simulated.mcu == Mcu::None {
+        let options = InProcessOptions::seeded(simulated.seed);
         let serial = options.serial.to_string();
         return Ok((Unclocked::InProcess(Box::new(InProcess::new(options)), serial), 0));
     }
-    let elf = serve.firmware.clone().unwrap_or_else(|| firmware_elf(Variant::F350));
+    let elf = simulated.firmware.clone().unwrap_or_else(|| firmware_elf(Variant::F350));
     let controller = McuController::load(Variant::F350, &elf).map_err(|error| {
         format!("{error}; build the firmware by `cargo xtask firmware`, or take --mcu none")
     })?;

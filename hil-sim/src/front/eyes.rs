@@ -50,21 +50,32 @@ impl Key {
         Self { camera: exposure.camera, exposure_us, gain_percent, lights_us }
     }
 
-    fn render(&self, world: &World, seed: u64) -> RawImage {
+    fn render(&self, world: &World, seed: u64) -> Vec<u8> {
         let lights: Vec<_> = self
             .lights_us
             .iter()
             .map(|&(source, us)| LightInterval { source, on_ns: 0, off_ns: us * 1000 })
             .collect();
         let gain = f64::from(self.gain_percent) / 100.0;
-        world.expose_with_gain(self.camera, 0, self.exposure_us * 1000, &lights, gain, seed)
+        let close_ns = self.exposure_us * 1000;
+        sent(&world.expose_with_gain(self.camera, 0, close_ns, &lights, gain, seed))
+    }
+}
+
+/// A picture as the camera sends it.
+fn sent(picture: &RawImage) -> Vec<u8> {
+    if picture.bits <= 8 {
+        picture.data.iter().map(|&v| v as u8).collect()
+    } else {
+        picture.data.iter().flat_map(|v| v.to_le_bytes()).collect()
     }
 }
 
 /// Pictures of a scene, kept where it stands still.
 pub struct FrameBank {
     world: Arc<World>,
-    kept: Mutex<BTreeMap<Key, Vec<Arc<RawImage>>>>,
+    /// As they are sent, each with noise of its own.
+    kept: Mutex<BTreeMap<Key, Vec<Arc<Vec<u8>>>>>,
 }
 
 impl FrameBank {
@@ -82,35 +93,40 @@ impl FrameBank {
         }
     }
 
-    /// The picture of an exposure.
+    /// The picture of an exposure, as it is sent.
     #[must_use]
-    pub fn picture(&self, exposure: &Exposure, gain_percent: u32) -> RawImage {
+    pub fn picture(&self, exposure: &Exposure, gain_percent: u32) -> Vec<u8> {
         let Exposure { camera, open_ns, close_ns, lights, .. } = exposure;
         if !self.world.is_still() {
             let gain = f64::from(gain_percent) / 100.0;
-            return self
-                .world
-                .expose_with_gain(*camera, *open_ns, *close_ns, lights, gain, *open_ns);
+            let world = &self.world;
+            return sent(
+                &world.expose_with_gain(*camera, *open_ns, *close_ns, lights, gain, *open_ns),
+            );
         }
         let variants = self.variants(&Key::of(exposure, gain_percent), *open_ns);
-        let first = &variants[0];
-        let mut data = Vec::with_capacity(first.data.len());
+        let model = self.world.model();
+        let height = match camera {
+            Camera::Left => model.left.height,
+            Camera::Right => model.right.height,
+        };
+        let row_bytes = variants[0].len() / height;
+        let mut bytes = Vec::with_capacity(variants[0].len());
         // SplitMix64 over the exposure's time and the row.
         let mut state = *open_ns;
-        for row in 0..first.height {
+        for row in 0..height {
             state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
             let mut bits = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
             bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
             let variant = &variants[((bits >> 40) % variants.len() as u64) as usize];
-            data.extend_from_slice(&variant.data[row * first.width..][..first.width]);
+            bytes.extend_from_slice(&variant[row * row_bytes..][..row_bytes]);
         }
-        RawImage { width: first.width, height: first.height, bits: first.bits, data }
+        bytes
     }
 
     /// The pictures that are there, after one more was made unless there are enough.
-    fn variants(&self, key: &Key, seed: u64) -> Vec<Arc<RawImage>> {
-        let known = |kept: &BTreeMap<Key, Vec<Arc<RawImage>>>| kept.get(key).cloned();
-        let mut variants = known(&self.lock()).unwrap_or_default();
+    fn variants(&self, key: &Key, seed: u64) -> Vec<Arc<Vec<u8>>> {
+        let mut variants = self.lock().get(key).cloned().unwrap_or_default();
         if variants.len() < VARIANTS {
             // Rendered without the lock: the other camera goes on.
             let seed = seed.wrapping_mul(VARIANTS as u64).wrapping_add(variants.len() as u64);
@@ -124,7 +140,7 @@ impl FrameBank {
         variants
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<Key, Vec<Arc<RawImage>>>> {
+    fn lock(&self) -> std::sync::MutexGuard<'_, BTreeMap<Key, Vec<Arc<Vec<u8>>>>> {
         // Entries are put in whole.
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -188,12 +204,7 @@ impl Eye {
             rig.set_longest_exposure_ns(self.camera, Some(longest_ns));
             rig.take_ready(self.camera)?
         };
-        let picture = self.bank.picture(&exposure, settings.gain_percent);
-        let pixels = if picture.bits <= 8 {
-            picture.data.iter().map(|&v| v as u8).collect()
-        } else {
-            picture.data.iter().flat_map(|v| v.to_le_bytes()).collect()
-        };
+        let pixels = self.bank.picture(&exposure, settings.gain_percent);
         let sof = self.bench.frame_number(exposure.open_ns);
         Some(Frame { pixels, exposure_ticks: self.ticks(exposure.open_ns), sof })
     }

@@ -1,39 +1,24 @@
-//! A USB/IP client over loopback, as a kernel's host controller would speak.
+//! The host's side of USB/IP over loopback, for tests: what goes wrong ends the test.
 #![allow(dead_code, reason = "each test binary uses its part")]
 
-use std::io::{Read, Write};
-use std::net::TcpStream;
-use std::time::Duration;
+use stspp_hil_sim::front::usbip::client::{self, Client, Transfer};
 
-pub struct Host {
-    pub stream: TcpStream,
-    sequence: u32,
-}
+pub struct Host(pub Client);
 
 /// Status and data of a reply.
 pub type Reply = (i32, Vec<u8>);
 
 impl Host {
     pub fn connect(port: u16) -> Self {
-        let stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
-        stream.set_nodelay(true).unwrap();
-        Self { stream, sequence: 0 }
+        Self(Client::connect(("127.0.0.1", port)).unwrap())
     }
 
     pub fn bytes(&mut self, count: usize) -> Vec<u8> {
-        let mut bytes = vec![0; count];
-        self.stream.read_exact(&mut bytes).unwrap();
-        bytes
+        self.0.bytes(count).unwrap()
     }
 
     pub fn import(&mut self, bus_id: &str) -> Option<Vec<u8>> {
-        let mut request = vec![1, 0x11, 0x80, 0x03, 0, 0, 0, 0];
-        request.extend(bus_id.as_bytes());
-        request.resize(8 + 32, 0);
-        self.stream.write_all(&request).unwrap();
-        let head = self.bytes(8);
-        (head[7] == 0).then(|| self.bytes(312))
+        self.0.import(bus_id).unwrap()
     }
 
     pub fn send(
@@ -44,39 +29,22 @@ impl Host {
         setup: [u8; 8],
         data: &[u8],
     ) -> u32 {
-        self.sequence += 1;
-        let fields =
-            [1, self.sequence, 0x10001, u32::from(is_in), endpoint, 0, length as u32, 0, 0, 0];
-        let mut command: Vec<u8> = fields.iter().flat_map(|f: &u32| f.to_be_bytes()).collect();
-        command.extend(setup);
-        command.extend(data);
-        self.stream.write_all(&command).unwrap();
-        self.sequence
+        let endpoint = endpoint as u8;
+        self.0.submit(&Transfer { is_in, endpoint, length, setup, data }).unwrap()
     }
 
-    pub fn reply(&mut self, is_in: bool) -> (u32, u32, Reply) {
-        let head = self.bytes(48);
-        let word = |at: usize| u32::from_be_bytes(head[at..at + 4].try_into().unwrap());
-        let data = if word(0) == 3 && is_in { self.bytes(word(24) as usize) } else { vec![] };
-        (word(0), word(4), (word(20) as i32, data))
+    /// Kind, sequence number of the command, status and data.
+    pub fn reply(&mut self) -> (u32, u32, Reply) {
+        let client::Reply { is_unlink, sequence, status, data } = self.0.reply().unwrap();
+        (if is_unlink { 4 } else { 3 }, sequence, (status, data))
     }
 
     pub fn control(&mut self, setup: [u8; 8], data: &[u8]) -> Reply {
-        let is_in = setup[0] & 0x80 != 0;
-        let length = usize::from(u16::from_le_bytes([setup[6], setup[7]]));
-        let sequence = self.send(is_in, 0, length, setup, data);
-        let (kind, answered, reply) = self.reply(is_in);
-        assert_eq!((kind, answered), (3, sequence));
-        reply
+        let reply = self.0.control(setup, data).unwrap();
+        (reply.status, reply.data)
     }
 
-    /// Gives up a transfer; returns the sequence number of that command.
     pub fn unlink(&mut self, victim: u32) -> u32 {
-        self.sequence += 1;
-        let fields = [2, self.sequence, 0, 0, 0, victim];
-        let mut command: Vec<u8> = fields.iter().flat_map(|f: &u32| f.to_be_bytes()).collect();
-        command.resize(48, 0);
-        self.stream.write_all(&command).unwrap();
-        self.sequence
+        self.0.unlink(victim).unwrap()
     }
 }

@@ -42,8 +42,8 @@ pub(crate) struct Budget {
     expected_s: f64,
     /// Every how manyth window is matched.
     every: u32,
-    /// Windows since the last match.
-    since: u32,
+    /// Trigger of the newest pair of the window that was matched last.
+    matched: Option<u32>,
     reduced: bool,
     reduced_frames: u32,
 }
@@ -55,7 +55,7 @@ impl Budget {
             period_s: 0.0,
             expected_s: 0.0,
             every: 1,
-            since: 0,
+            matched: None,
             reduced: false,
             reduced_frames: 0,
         }
@@ -65,15 +65,18 @@ impl Budget {
     pub fn set_period(&mut self, period: Duration) {
         self.period_s = period.as_secs_f64();
         self.every = 1;
+        self.matched = None;
     }
 
-    /// Whether the next complete window is matched.
-    pub fn admit(&mut self) -> bool {
-        self.since += 1;
-        if self.since < self.every {
+    /// Whether the complete window that ends with trigger `sequence` is matched. What counts is how many
+    /// triggers ago the last match was: a machine that loses pairs while it matches has waited long
+    /// enough when it has the next window together.
+    pub fn admit(&mut self, sequence: u32) -> bool {
+        let since = self.matched.map(|matched| sequence.wrapping_sub(matched));
+        if since.is_some_and(|since| since < self.every) {
             return false;
         }
-        self.since = 0;
+        self.matched = Some(sequence);
         true
     }
 
@@ -141,8 +144,9 @@ mod tests {
     /// those at lower quality among `windows`.
     fn simulate(budget: &mut Budget, windows: u32, cost_ms: impl Fn(bool) -> f64) -> (u32, u32) {
         let (mut matched, mut reduced) = (0, 0);
-        for _ in 0..windows {
-            if budget.admit() {
+        let first = budget.matched.map_or(0, |matched| matched + 1);
+        for sequence in first..first + windows {
+            if budget.admit(sequence) {
                 matched += 1;
                 reduced += u32::from(budget.is_reduced());
                 budget.record(Duration::from_secs_f64(cost_ms(budget.is_reduced()) * 1e-3));
@@ -169,7 +173,7 @@ mod tests {
         // 70 ms fit into three periods of 30 ms.
         assert!((33..=36).contains(&matched) && reduced == 0, "{matched} {reduced}");
         assert_eq!(slow.every(), 3);
-        let beats: Vec<bool> = (0..9).map(|_| slow.admit()).collect();
+        let beats: Vec<bool> = (1000..1009).map(|sequence| slow.admit(sequence)).collect();
         assert_eq!(beats.iter().filter(|b| **b).count(), 3);
         assert!((0..6).all(|k| beats[k] == beats[k + 3]));
     }
@@ -183,6 +187,17 @@ mod tests {
         assert!(reduced < matched, "full quality is tried again");
         // A floor of zero never gives quality up.
         assert_eq!(simulate(&mut budget(0.0), 3000, cost).1, 0);
+    }
+
+    #[test]
+    fn pairs_that_were_lost_meanwhile_count_as_waiting() {
+        let mut slow = budget(0.0);
+        assert!(slow.admit(9));
+        slow.record(Duration::from_secs(7));
+        assert!(slow.every() > 200);
+        // A few windows fill, and many triggers pass without one.
+        assert!(!slow.admit(20) && !slow.admit(150));
+        assert!(slow.admit(9 + slow.every()));
     }
 
     #[test]

@@ -277,7 +277,7 @@ impl MatchThread {
             self.progress.count(|s| s.skipped_windows += 1);
             return true;
         }
-        if !self.lossless && !self.budget.admit() {
+        if !self.lossless && !self.budget.admit(pair.label.sequence) {
             self.progress.count(|s| s.skipped_windows += 1);
             return true;
         }

@@ -65,8 +65,11 @@ impl PairThread {
                 break;
             }
         }
-        // Capture ends soon; what it still had is counted.
-        self.stop.stop();
+        // Nobody wants more: capture ends soon; what it still had is counted. Where capture ended by
+        // itself, what it said last is on its way and must arrive: then nothing is stopped here.
+        if !going_on {
+            self.stop.stop();
+        }
         for item in self.input.iter() {
             if let Captured::Frame(_) = item {
                 self.progress.count(|s| s.rejected.count(Reject::Discarded));

@@ -72,7 +72,10 @@ impl SimSensor {
             .map_err(|error| Error::Simulation(error.to_string()))?;
         let world = Arc::new(world);
         let pixels = calibration.left.resolution_px[0] * calibration.left.resolution_px[1];
-        let rig = Rig::new(controller, options.pace, readout_ns(pixels));
+        let mut rig = Rig::new(controller, options.pace, readout_ns(pixels));
+        if options.trigger_hz > 0.0 {
+            rig.generate_trigger(options.trigger_hz);
+        }
         let clock = rig.clock();
         let rig = Arc::new(Mutex::new(rig));
         Ok(Self {

@@ -9,7 +9,8 @@ use crate::{Error, UriError};
 pub const DEFAULT_SCENE: &str = "sphere";
 
 /// Options of the sensor; a scene has its own besides.
-const KNOWN: &str = "seed, scale, bits, pace, rig, mcu, and the scene's own (stspp list --scenes)";
+const KNOWN: &str =
+    "seed, scale, bits, pace, rig, mcu, trigger_hz, and the scene's own (stspp list --scenes)";
 
 /// Options of the sensor: name, default, what it does.
 pub const SENSOR_OPTIONS: &[(&str, &str, &str)] = &[
@@ -19,6 +20,7 @@ pub const SENSOR_OPTIONS: &[(&str, &str, &str)] = &[
     ("pace", "fast", "fast: time passes as frames are consumed; real: as on the wall"),
     ("rig", "default", "default, or a whole number for a rig with other optics and poses"),
     ("mcu", "none", "none: the firmware's logic in process; f330 or f350: its binary, emulated"),
+    ("trigger_hz", "0", "edges a second at the controller's trigger-in; 0: nothing is connected"),
 ];
 
 /// How fast simulated time passes.
@@ -62,6 +64,8 @@ pub struct SimOptions {
     pub rig_seed: Option<u64>,
     /// What runs its controller.
     pub mcu: SimMcu,
+    /// Rising edges a second at trigger-in, from a machine that is connected there; 0 for none.
+    pub trigger_hz: f64,
 }
 
 impl SimOptions {
@@ -78,6 +82,7 @@ impl SimOptions {
         let mut pace = Pace::default();
         let mut rig_seed = None;
         let mut mcu = SimMcu::default();
+        let mut trigger_hz = 0.0;
         let mut of_scene = Vec::new();
         for (name, value) in options {
             let wrong = |expected: &str| UriError::OptionValue {
@@ -120,6 +125,13 @@ impl SimOptions {
                         _ => return Err(wrong("none, f330 or f350").into()),
                     };
                 }
+                "trigger_hz" => {
+                    let expected = "a number of edges a second, at most 1000";
+                    trigger_hz = match value.parse() {
+                        Ok(hz @ 0.0..=1000.0) => hz,
+                        _ => return Err(wrong(expected).into()),
+                    };
+                }
                 _ => of_scene.push((name.as_str(), value.as_str())),
             }
         }
@@ -128,7 +140,17 @@ impl SimOptions {
             let model = model(seed, scale, bits, rig_seed);
             let scene_name = scene_name.to_owned();
             let scene = tour.scene(&model);
-            return Ok(Self { scene, scene_name, seed, scale, bits, pace, rig_seed, mcu });
+            return Ok(Self {
+                scene,
+                scene_name,
+                seed,
+                scale,
+                bits,
+                pace,
+                rig_seed,
+                mcu,
+                trigger_hz,
+            });
         }
         let known = list_scenes().iter().find(|s| s.name == scene_name);
         let unknown = of_scene
@@ -141,7 +163,7 @@ impl SimOptions {
         let scene = SceneSpec::parse(scene_name, &of_scene)
             .map_err(|error| Error::Simulation(error.to_string()))?;
         let scene_name = scene_name.to_owned();
-        Ok(Self { scene, scene_name, seed, scale, bits, pace, rig_seed, mcu })
+        Ok(Self { scene, scene_name, seed, scale, bits, pace, rig_seed, mcu, trigger_hz })
     }
 
     /// The sensor's optics and electronics.
@@ -191,6 +213,7 @@ mod tests {
         assert!(parse("sim:plane?bits=9").unwrap_err().contains("8, 10 or 12"));
         assert!(parse("sim:plane?mcu=avr").unwrap_err().contains("f330 or f350"));
         assert!(parse("sim:plane?pace=slow").unwrap_err().contains("fast or real"));
+        assert!(parse("sim:plane?trigger_hz=-1").unwrap_err().contains("edges a second"));
         assert!(parse("sim:plane?distance_m=far").unwrap_err().contains("distance_m"));
     }
 }

@@ -21,6 +21,15 @@ pub struct Rig {
     inner: rig::Rig,
     clock: Arc<VirtualClock>,
     wall: Option<Arc<MonotonicClock>>,
+    generator: Option<Generator>,
+}
+
+/// What another machine does at trigger-in: a square wave.
+struct Generator {
+    half_period_ns: u64,
+    /// Time of its next edge.
+    next_ns: u64,
+    high: bool,
 }
 
 impl Rig {
@@ -29,7 +38,15 @@ impl Rig {
         let wall = (pace == Pace::Real).then(|| Arc::new(MonotonicClock::new()));
         let kept = if wall.is_some() { FRAMES_KEPT } else { FRAMES_KEPT_FAST };
         let inner = rig::Rig::new(controller, readout_ns, kept);
-        Self { inner, clock: Arc::new(VirtualClock::new()), wall }
+        Self { inner, clock: Arc::new(VirtualClock::new()), wall, generator: None }
+    }
+
+    /// Connects a square wave with `hz` rising edges a second to trigger-in; 0 disconnects it.
+    pub fn generate_trigger(&mut self, hz: f64) {
+        self.inner.controller().set_trigger_in(false);
+        let half_period_ns = (0.5e9 / hz) as u64;
+        let next_ns = self.inner.now_ns().saturating_add(half_period_ns);
+        self.generator = (hz > 0.0).then_some(Generator { half_period_ns, next_ns, high: false });
     }
 
     /// The clock of this rig's time.
@@ -123,6 +140,12 @@ impl Rig {
     }
 
     fn step(&mut self, to_ns: u64) {
+        while let Some(generator) = self.generator.as_mut().filter(|g| g.next_ns < to_ns) {
+            self.inner.advance(generator.next_ns);
+            generator.high = !generator.high;
+            generator.next_ns += generator.half_period_ns;
+            self.inner.controller().set_trigger_in(generator.high);
+        }
         self.inner.advance(to_ns);
         self.clock.advance_to_ns(self.inner.now_ns());
     }

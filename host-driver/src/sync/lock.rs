@@ -48,10 +48,17 @@ pub struct Lock {
     pub latencies_ns: Vec<(u32, i64)>,
 }
 
+/// Newest events that tie the host's clock to the device's. When the host's clock has stepped, events of
+/// before say nothing of it any more: they must be gone before [`FRAMES_ALONE`] frames could agree on a
+/// wrong shift.
+const EVENTS: usize = 8;
+
 /// Offset from device to host time: the least time from an exposure's end, when the device sends the
-/// trigger's event, to the event's arrival. The least delayed event was not queued anywhere.
-pub fn host_from_device_ns<'a>(triggers: impl Iterator<Item = &'a Trigger>) -> Option<i64> {
-    triggers
+/// trigger's event, to the event's arrival. The least delayed event was not queued anywhere. Triggers
+/// come newest first.
+pub fn host_from_device_ns<'a>(newest: impl Iterator<Item = &'a Trigger>) -> Option<i64> {
+    newest
+        .take(EVENTS)
         .map(|t| t.arrival_host_ns.wrapping_sub(t.time_device_ns() + t.exposure_ns()) as i64)
         .min()
 }
@@ -62,7 +69,7 @@ pub fn find(triggers: &[Trigger], frames: &[FrameStamp], config: &LockConfig) ->
     if frames.len() < FRAMES_AGREED || triggers.len() < FRAMES_AGREED {
         return None;
     }
-    let host_from_device_ns = host_from_device_ns(triggers.iter())?;
+    let host_from_device_ns = host_from_device_ns(triggers.iter().rev())?;
     let mut delays_ns: Vec<i64> = frames
         .iter()
         .map(|f| f.arrival_host_ns.wrapping_sub(f.timestamp_camera_ns) as i64)

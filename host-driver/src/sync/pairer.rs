@@ -435,7 +435,9 @@ impl<F> Pairer<F> {
 
     /// Decides on one held frame, and learns from it.
     fn judge(&mut self, stamp: &FrameStamp, now_host_ns: u64) -> Verdict {
-        let host_from_device_ns = lock::host_from_device_ns(self.triggers());
+        let newest = self.pending.iter().rev().map(|p| &p.trigger);
+        let newest = newest.chain(self.finished.iter().rev().map(|f| &f.trigger));
+        let host_from_device_ns = lock::host_from_device_ns(newest);
         let found = self.by_time(stamp);
         let confirmations = found
             .as_ref()

@@ -1,35 +1,31 @@
 //! The simulated sensor, the machine that it is plugged into, and what scenarios do with them.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
 use super::machine::{Machine, Reply};
+use super::score::Score;
 use super::server::Server;
 use crate::workspace;
 
-/// The cameras have 1/SCENE_SCALE of the pixels in each direction: the guest's processor is emulated, and
-/// its kernel moves about 10 MB/s from USB with all of it. Full-size pictures at the slowest rate would
-/// be 40.
+/// In most scenarios the cameras have 1/SCENE_SCALE of the pixels in each direction: the guest's processor
+/// is emulated. What depends on size is tried at full size too.
 pub const SCENE_SCALE: u32 = 4;
 
 /// What the guest's programs wait for a result: its processor is emulated.
 pub const TIMEOUT_S: &str = "20";
 
-/// How depth is matched, in the guest and in process: the fastest of the sub-pixel methods, because
-/// per-point IC-GN takes minutes on an emulated processor.
-pub const METHOD: &str = "dense";
-
-/// Depth frames that are held against the truth: the RMS of one varies by two per cent.
-pub const DEPTH_FRAMES: &str = "3";
-
 /// It is dark when no light was seen for so long: between two exposures there is none either.
 const DARK: Duration = Duration::from_millis(400);
 
 /// Where the guest finds the cameras' calibration.
-pub const CALIBRATION: &str = "etc/stspp/camchain.yaml";
+pub const CALIBRATION: &str = "/etc/stspp/camchain.yaml";
+
+/// What stands before the sensor.
+pub const SCENE: &str = "sphere";
 
 /// Devices by name: virtio port and bus id.
 pub const DEVICES: [(&str, &str, &str); 3] =
@@ -43,48 +39,59 @@ pub struct Bench {
     pub server: Server,
     /// For files that come out of the guest.
     pub folder: PathBuf,
-    /// The in-process result, once computed.
-    in_process: Option<Score>,
-    /// The program that compares clouds with the truth.
-    pub scorer: PathBuf,
-    /// The program under test, on this machine.
-    pub stspp: PathBuf,
-}
-
-/// How a cloud compares with the truth.
-#[derive(Debug, Clone, Copy)]
-pub struct Score {
-    /// Points of a frame.
-    pub points: u64,
-    /// RMS of a frame's errors within 5 mm.
-    pub rms_mm: f64,
-}
-
-impl Score {
-    fn mean(scores: &[Self]) -> Self {
-        let count = scores.len().max(1);
-        Self {
-            points: scores.iter().map(|s| s.points).sum::<u64>() / count as u64,
-            rms_mm: scores.iter().map(|s| s.rms_mm).sum::<f64>() / count as f64,
-        }
-    }
+    /// The cameras have 1/scale of the pixels in each direction.
+    pub scale: u32,
+    /// The same scenes captured without USB, by their scale, once computed.
+    pub in_process: BTreeMap<u32, Score>,
 }
 
 impl Bench {
     /// A bench whose devices are not plugged in yet.
-    pub fn new(
-        machine: Machine,
-        server: Server,
-        folder: &Path,
-        stspp: PathBuf,
-        scorer: PathBuf,
-    ) -> Self {
-        Self { machine, server, folder: folder.to_owned(), in_process: None, scorer, stspp }
+    pub fn new(machine: Machine, server: Server, folder: &Path) -> Self {
+        let (folder, in_process) = (folder.to_owned(), BTreeMap::new());
+        Self { machine, server, folder, scale: SCENE_SCALE, in_process }
+    }
+
+    /// Plugs all devices in, and gives the guest their calibration.
+    ///
+    /// # Errors
+    /// What the guest said.
+    pub fn plug_all_in(&mut self) -> Result<(), String> {
+        let file = self.folder.join("camchain.yaml");
+        let text =
+            std::fs::read_to_string(&file).map_err(|e| format!("{}: {e}", file.display()))?;
+        let reply = self.machine.request(&["write", CALIBRATION, &text.replace('\n', "\x1e")])?;
+        if reply.code != 0 {
+            return Err(format!("{CALIBRATION}: {}", reply.text()));
+        }
+        DEVICES.iter().try_for_each(|(device, ..)| self.plug_in(device))
+    }
+
+    /// Unplugs the sensor and plugs in one with cameras of another size.
+    ///
+    /// # Errors
+    /// When it does not start; what the guest said.
+    pub fn exchange(&mut self, scale: u32) -> Result<(), String> {
+        for (device, ..) in DEVICES {
+            self.server.command(&format!("unplug {device}"))?;
+        }
+        self.server.end();
+        self.server = serve(&self.folder, scale, self.server.port)?;
+        self.scale = scale;
+        self.plug_all_in()?;
+        super::scenario::nodes(self)?;
+        let deadline = Instant::now() + Duration::from_secs(30);
+        while !self.finds_sensor()? {
+            if Instant::now() > deadline {
+                return Err("the other sensor is not found".into());
+            }
+        }
+        Ok(())
     }
 
     /// The source of the simulated sensor in the guest.
     pub fn source(&self) -> String {
-        format!("usb:?calibration=/{CALIBRATION}")
+        format!("usb:?calibration={CALIBRATION}")
     }
 
     /// Plugs a device into the guest.
@@ -280,79 +287,18 @@ impl Bench {
         let reply = self.machine.request(&["read", path])?;
         if reply.code == 0 { Ok(reply.bytes) } else { Err(format!("{path}: {}", reply.text())) }
     }
-
-    /// Compares the clouds that the guest has captured into `folder` with the scene.
-    ///
-    /// # Errors
-    /// When one is not there, or the comparison fails.
-    pub fn score(&mut self, folder: &str) -> Result<Score, String> {
-        let mut scores = Vec::new();
-        for name in cloud_names() {
-            let cloud = self.file(&format!("{folder}/{name}"))?;
-            let path = self.folder.join("guest.ply");
-            std::fs::write(&path, cloud).map_err(|e| format!("{}: {e}", path.display()))?;
-            scores.push(self.score_file(&path)?);
-        }
-        Ok(Score::mean(&scores))
-    }
-
-    fn score_file(&self, path: &Path) -> Result<Score, String> {
-        let output = Command::new(&self.scorer)
-            .arg(path)
-            .arg(scene_uri())
-            .output()
-            .map_err(|e| format!("{}: {e}", self.scorer.display()))?;
-        let text = String::from_utf8_lossy(&output.stdout).into_owned();
-        let json: Value = serde_json::from_str(&text).map_err(|_| {
-            format!("comparison with the truth: {}", String::from_utf8_lossy(&output.stderr))
-        })?;
-        let rms_mm = json["rms_mm"].as_f64().unwrap_or(f64::NAN);
-        Ok(Score { points: json["points"].as_u64().unwrap_or(0), rms_mm })
-    }
-
-    /// The same scene captured on this machine, without USB: computed once.
-    ///
-    /// # Errors
-    /// When that fails.
-    pub fn in_process_score(&mut self) -> Result<Score, String> {
-        if let Some(score) = self.in_process {
-            return Ok(score);
-        }
-        let out = self.folder.join("in-process");
-        let status = Command::new(&self.stspp)
-            .args([
-                "capture",
-                "--quiet",
-                "--force",
-                "--method",
-                METHOD,
-                "-n",
-                DEPTH_FRAMES,
-                "--source",
-            ])
-            .args([&scene_uri(), "--out"])
-            .arg(&out)
-            .stdout(std::process::Stdio::null())
-            .status();
-        if !status.is_ok_and(|s| s.success()) {
-            return Err("the capture in process failed".into());
-        }
-        let scores: Result<Vec<Score>, String> =
-            cloud_names().map(|name| self.score_file(&out.join(name))).collect();
-        let score = Score::mean(&scores?);
-        self.in_process = Some(score);
-        Ok(score)
-    }
 }
 
-/// Where [`DEPTH_FRAMES`] captured frames have their clouds.
-fn cloud_names() -> impl Iterator<Item = String> {
-    (0..DEPTH_FRAMES.parse().unwrap_or(1)).map(|k: u32| format!("{k:04}/cloud.ply"))
-}
-
-/// The scene as a source of the in-process simulator.
-pub fn scene_uri() -> String {
-    format!("sim:sphere?scale={SCENE_SCALE}")
+/// Starts the simulated sensor; its calibration is written into `folder`.
+///
+/// # Errors
+/// When it does not start.
+pub fn serve(folder: &Path, scale: u32, port: u16) -> Result<Server, String> {
+    let calibration = folder.join("camchain.yaml").display().to_string();
+    let scale = scale.to_string();
+    let arguments =
+        ["--patient", "--scene", SCENE, "--scale", &scale, "--calibration", &calibration];
+    Server::start(&built("hil-sim"), &arguments, port, &folder.join("hil-sim.log"))
 }
 
 /// Where cargo puts a program.

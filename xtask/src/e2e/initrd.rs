@@ -70,8 +70,7 @@ impl Archive {
     }
 }
 
-/// The guest's archive: `init` as first process, `programs` under /bin by the names given, `files` at
-/// their paths.
+/// The guest's archive: `init` as first process, `programs` under /bin by the names given.
 ///
 /// # Errors
 /// Names the file that could not be read.
@@ -79,15 +78,11 @@ pub fn build(
     kernel: &Kernel,
     init: &Path,
     programs: &[(&str, PathBuf)],
-    files: &[(&str, Vec<u8>)],
 ) -> Result<Vec<u8>, String> {
     let mut archive = Archive::default();
     let mut libraries = BTreeSet::new();
     archive.file("init", 0o755, &read(init)?);
     libraries.extend(needs(init)?);
-    for (path, content) in files {
-        archive.file(path, 0o644, content);
-    }
     for (name, program) in programs {
         archive.file(&format!("bin/{name}"), 0o755, &read(program)?);
         libraries.extend(needs(program)?);

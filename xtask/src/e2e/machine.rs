@@ -3,12 +3,18 @@
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::net::UnixStream;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Longest wait for an answer: more than any program in the guest may take.
 const PATIENCE: Duration = Duration::from_secs(200);
+
+/// All that QEMU can emulate, but for "enhanced rep movsb": kernel and C library copy memory by that
+/// instruction where it is there, and QEMU emulates it byte by byte. Without it both copy by words,
+/// which is seven times faster (118 against 810 MB/s through a socket).
+const CPU: &str = "max,-erms";
 
 /// A running machine; ended when dropped, whatever happened.
 pub struct Machine {
@@ -55,7 +61,7 @@ impl Machine {
         let console = folder.join("console.log");
         let mut command = Command::new("qemu-system-x86_64");
         command
-            .args(["-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", "1536"])
+            .args(["-accel", "tcg,thread=multi", "-cpu", CPU, "-smp", "2", "-m", "1536"])
             .args(["-nographic", "-nodefaults", "-no-reboot", "-monitor", "none"])
             .arg("-kernel")
             .arg(kernel)
@@ -76,7 +82,7 @@ impl Machine {
                 .arg(format!("socket,id={port},host=127.0.0.1,port={usbip_port},reconnect=1"))
                 .args(["-device", &format!("virtserialport,chardev={port},name={port}")]);
         }
-        let mut qemu = command
+        let mut qemu = dies_with_us(&mut command)
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(File::create(folder.join("qemu.log")).map_err(|e| format!("qemu's log: {e}"))?)
@@ -146,6 +152,18 @@ impl Machine {
 
     fn explain(&self, error: &str) -> String {
         format!("{error}\n{}", tail(&self.folder.join("console.log")))
+    }
+}
+
+/// Has a child killed when this thread ends, even by a signal that nothing can be done about.
+pub fn dies_with_us(command: &mut Command) -> &mut Command {
+    // SAFETY: prctl with PR_SET_PDEATHSIG is a plain system call, which may be made between fork and
+    // exec, and touches no memory.
+    unsafe {
+        command.pre_exec(|| {
+            libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL);
+            Ok(())
+        })
     }
 }
 

@@ -9,18 +9,22 @@
 //!
 //! [`kernel`] fetches a Debian kernel, [`initrd`] packs the guest, [`machine`] boots it and talks to its
 //! first process, [`server`] is the simulated sensor, [`bench`](mod@bench) both together, [`scenario`]
-//! what is tried. Everything ends with this process, however that ends.
+//! and [`depth`] what is tried, [`score`] how depth compares with the truth. Everything ends with this
+//! process, however that ends.
 
 mod bench;
+mod depth;
 mod initrd;
 mod kernel;
 mod machine;
 mod scenario;
+mod score;
 mod server;
 
+use crate::stage::{self, Outcome};
 use crate::{debian, firmware, workspace};
-use bench::{Bench, CALIBRATION, DEVICES, SCENE_SCALE, built};
-use std::path::{Path, PathBuf};
+use bench::{Bench, DEVICES, SCENE_SCALE, built};
+use std::path::PathBuf;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -43,25 +47,31 @@ struct Tried {
 /// Which scenarios failed, or which step before them.
 pub fn run(only: Option<&str>) -> Result<String, String> {
     debian::ensure(PACKAGES)?;
-    let kernel = kernel::prepare()?;
+    run_with(&kernel::prepare()?, only)
+}
+
+/// All scenarios as a stage of the test command: skipped only where the machine, the packages or the
+/// firmware for it cannot be had.
+pub fn stage() -> Outcome {
+    if !cfg!(all(target_os = "linux", target_arch = "x86_64")) {
+        return Outcome::Skipped("the guest is a Linux machine of the x86-64 kind".into());
+    }
+    if !firmware::images_are_there() {
+        return Outcome::Skipped("there is no firmware to run: see the stage \"firmware\"".into());
+    }
+    match debian::ensure(PACKAGES).and_then(|()| kernel::prepare()) {
+        Ok(kernel) => stage::check(run_with(&kernel, None)),
+        Err(why) => Outcome::Skipped(why),
+    }
+}
+
+fn run_with(kernel: &kernel::Kernel, only: Option<&str>) -> Result<String, String> {
     let folder = workspace::root().join("target/e2e");
     let programs = build()?;
     let begun = Instant::now();
-    let calibration = folder.join("camchain.yaml");
-    let scale = SCENE_SCALE.to_string();
-    let arguments = [
-        "--patient",
-        "--scene",
-        "sphere",
-        "--scale",
-        &scale,
-        "--calibration",
-        &calibration.display().to_string(),
-    ];
-    let server = server::Server::start(&built("hil-sim"), &arguments, &folder.join("hil-sim.log"))?;
+    let server = bench::serve(&folder, SCENE_SCALE, 0)?;
     let in_guest = [("stspp", built("stspp")), ("transports", programs.transports)];
-    let files = [(CALIBRATION, read(&calibration)?)];
-    let archive = initrd::build(&kernel, &built("guest-init"), &in_guest, &files)?;
+    let archive = initrd::build(kernel, &built("guest-init"), &in_guest)?;
     let image = folder.join("initrd.cpio");
     std::fs::write(&image, archive).map_err(|e| format!("{}: {e}", image.display()))?;
 
@@ -69,11 +79,8 @@ pub fn run(only: Option<&str>) -> Result<String, String> {
     let ports = DEVICES.map(|(_, port, _)| port);
     let machine = machine::Machine::boot(&kernel.image, &image, &ports, server.port, &folder)?;
     println!("guest is up after {:.1} s", start.elapsed().as_secs_f64());
-    let scorer = built("examples/cloud_against_truth");
-    let mut bench = Bench::new(machine, server, &folder, built("stspp"), scorer);
-    for (device, ..) in DEVICES {
-        bench.plug_in(device)?;
-    }
+    let mut bench = Bench::new(machine, server, &folder);
+    bench.plug_all_in()?;
     let mut outcomes: Vec<Tried> = Vec::new();
     for (name, scenario) in scenario::ALL {
         // What the kernel makes of the devices and the guest's pace come before all else.
@@ -115,10 +122,6 @@ fn line(outcome: &Tried) -> String {
     };
     let seconds = outcome.took.as_secs_f64();
     format!("{:<28} {word:<7} {seconds:>6.1} s  {text}", outcome.name)
-}
-
-fn read(path: &Path) -> Result<Vec<u8>, String> {
-    std::fs::read(path).map_err(|e| format!("{}: {e}", path.display()))
 }
 
 /// What [`build`] has made, besides what has a fixed place.

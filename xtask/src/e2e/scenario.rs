@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::bench::{Bench, DEPTH_FRAMES, METHOD, SCENE_SCALE, TIMEOUT_S};
+use super::bench::{Bench, TIMEOUT_S};
+use super::depth;
 
 /// A scenario's name, and what runs it: what was seen, or what was wrong.
 pub type Scenario = (&'static str, fn(&mut Bench) -> Result<String, String>);
@@ -22,7 +23,8 @@ pub const ALL: &[Scenario] = &[
     ("doctor", doctor),
     ("camera controls", camera_controls),
     ("ten pairs", pairs),
-    ("depth against truth", depth),
+    ("ten depth frames", depth::depth),
+    ("live depth", depth::stream),
     ("device busy", busy),
     ("lost frame", |bench| frame_fault(bench, "left", "lost")),
     ("duplicated frame", |bench| frame_fault(bench, "right", "duplicated")),
@@ -35,10 +37,16 @@ pub const ALL: &[Scenario] = &[
     ("firmware hangs", hang),
     ("interlock opens", interlock),
     ("clock of the host steps", clock_step),
-    ("depth after all faults", depth),
+    ("depth after all faults", depth::depth),
+    ("pairs at full size", depth::full_pairs),
+    ("depth at full size", depth::full_depth),
 ];
 
-fn nodes(bench: &mut Bench) -> Result<String, String> {
+/// Waits until the kernel has made its nodes of all devices.
+///
+/// # Errors
+/// What it made.
+pub fn nodes(bench: &mut Bench) -> Result<String, String> {
     let expected = ["stspp left camera", "stspp right camera"];
     let deadline = Instant::now() + Duration::from_secs(20);
     let mut names = Vec::new();
@@ -159,12 +167,16 @@ fn stream(bench: &mut Bench, count: &str) -> Result<Value, String> {
     Ok(stats)
 }
 
-fn number(stats: &Value, path: &str) -> u64 {
+/// A counter by its place.
+pub fn number(stats: &Value, path: &str) -> u64 {
     stats.pointer(path).and_then(Value::as_u64).unwrap_or(0)
 }
 
 /// Every frame is in a pair, rejected by a cause, or dropped.
-fn add_up(stats: &Value) -> Result<(), String> {
+///
+/// # Errors
+/// The counters.
+pub fn add_up(stats: &Value) -> Result<(), String> {
     let rejected: u64 = stats["rejected"]
         .as_object()
         .map_or(0, |causes| causes.values().filter_map(Value::as_u64).sum());
@@ -182,40 +194,6 @@ fn pairs(bench: &mut Bench) -> Result<String, String> {
     let [pairs, triggers] = ["/pairs", "/triggers"].map(|p| number(&stats, p));
     bench.dark()?;
     Ok(format!("{pairs} pairs of {triggers} triggers, all frames accounted for"))
-}
-
-fn depth(bench: &mut Bench) -> Result<String, String> {
-    let source = bench.source();
-    let arguments = [
-        "capture",
-        "--force",
-        "--json",
-        "--timeout",
-        "60",
-        "--method",
-        METHOD,
-        "-n",
-        DEPTH_FRAMES,
-        "--source",
-        &source,
-        "--out",
-        "/tmp/depth",
-    ];
-    bench.stspp_ok(150, &arguments)?;
-    let guest = bench.score("/tmp/depth")?;
-    let host = bench.in_process_score()?;
-    let ratio = guest.rms_mm / host.rms_mm;
-    let told = format!(
-        "mean RMS of {DEPTH_FRAMES} {:.4} mm, in-process {:.4} mm ({:+.1} %), {} and {} points at 1/{SCENE_SCALE} scale",
-        guest.rms_mm,
-        host.rms_mm,
-        100.0 * (ratio - 1.0),
-        guest.points,
-        host.points
-    );
-    bench.dark()?;
-    let alike = (0.95..=1.05).contains(&ratio) && guest.points * 100 >= host.points * 97;
-    if alike { Ok(told) } else { Err(told) }
 }
 
 fn busy(bench: &mut Bench) -> Result<String, String> {

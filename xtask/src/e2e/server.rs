@@ -19,15 +19,22 @@ pub struct Server {
 }
 
 impl Server {
-    /// Starts `program` with `arguments` and waits until it listens; its messages go to `log`.
+    /// Starts `program` with `arguments`, listening at `port` (0 takes a free one), and waits until it
+    /// does; its messages go to `log`.
     ///
     /// # Errors
     /// When it does not start; its last messages are in the text.
-    pub fn start(program: &Path, arguments: &[&str], log: &Path) -> Result<Self, String> {
+    pub fn start(
+        program: &Path,
+        arguments: &[&str],
+        port: u16,
+        log: &Path,
+    ) -> Result<Self, String> {
         let failed = |e: std::io::Error| format!("{}: {e}", program.display());
         let messages = std::fs::File::create(log).map_err(failed)?;
-        let mut process = Command::new(program)
-            .args(["serve", "--usbip", "--listen", "127.0.0.1:0"])
+        let mut command = Command::new(program);
+        command.args(["serve", "--usbip", "--listen", &format!("127.0.0.1:{port}")]);
+        let mut process = super::machine::dies_with_us(&mut command)
             .args(arguments)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -79,9 +86,16 @@ impl Server {
     }
 }
 
-impl Drop for Server {
-    fn drop(&mut self) {
+impl Server {
+    /// Ends it.
+    pub fn end(&mut self) {
         let _ = self.process.kill();
         let _ = self.process.wait();
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.end();
     }
 }

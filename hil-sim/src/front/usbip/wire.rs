@@ -1,5 +1,6 @@
 //! Byte layout of USB/IP 1.1.1: all fields big-endian, commands and replies 48 bytes and then data.
 
+use super::client::Transfer;
 use crate::front::usb::{Identity, Speed};
 use std::io::{self, Read};
 
@@ -120,7 +121,61 @@ pub fn unlink_reply(sequence: u32, status: i32) -> Vec<u8> {
     reply
 }
 
-/// Header of an operation's reply.
+/// The head of a reply, as the host reads it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ReplyHead {
+    /// Whether it answers an unlink.
+    pub is_unlink: bool,
+    /// Sequence number of the command.
+    pub sequence: u32,
+    /// 0 or a negative errno.
+    pub status: i32,
+    /// Bytes that were moved; those of an IN transfer follow.
+    pub length: usize,
+}
+
+/// Reads the head of the next reply.
+///
+/// # Errors
+/// The stream's, and `InvalidData` for what is no reply.
+pub fn read_reply(stream: &mut impl Read) -> io::Result<ReplyHead> {
+    let mut head = [0; 48];
+    stream.read_exact(&mut head)?;
+    let is_unlink = match word(&head, 0) {
+        RET_SUBMIT => false,
+        RET_UNLINK => true,
+        _ => return Err(invalid("an unknown reply")),
+    };
+    let length = if is_unlink { 0 } else { word(&head, 24) as usize };
+    if length > TRANSFER_MAX {
+        return Err(invalid("a transfer beyond all bounds"));
+    }
+    Ok(ReplyHead { is_unlink, sequence: word(&head, 4), status: word(&head, 20) as i32, length })
+}
+
+/// The command that asks for a transfer; data to the device follows it.
+pub fn submit_command(sequence: u32, transfer: &Transfer<'_>) -> Vec<u8> {
+    let mut command = Vec::with_capacity(48 + transfer.data.len());
+    let (is_in, endpoint) = (u32::from(transfer.is_in), u32::from(transfer.endpoint));
+    for field in
+        [CMD_SUBMIT, sequence, 0x1_0001, is_in, endpoint, 0, transfer.length as u32, 0, 0, 0]
+    {
+        command.extend(field.to_be_bytes());
+    }
+    command.extend(transfer.setup);
+    command
+}
+
+/// The command that gives a transfer up.
+pub fn unlink_command(sequence: u32, victim: u32) -> Vec<u8> {
+    let mut command = Vec::with_capacity(48);
+    for field in [CMD_UNLINK, sequence, 0, 0, 0, victim, 0, 0, 0, 0, 0, 0] {
+        command.extend(field.to_be_bytes());
+    }
+    command
+}
+
+/// Header of an operation's request or reply.
 pub fn operation_header(code: u16, ok: bool) -> Vec<u8> {
     let mut header = Vec::with_capacity(8);
     header.extend(VERSION.to_be_bytes());

@@ -47,7 +47,9 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let new_folder =
         |k| OutputFolder::create(&folder(k), args.force).map_err(|e| output_failure(&e));
     let mut next = Some(new_folder(0)?);
-    let options = stream_options(Some(&args.source), Some(&args.matching));
+    let mut options = stream_options(Some(&args.source), Some(&args.matching));
+    // Files are worth waiting for: a slow machine makes fewer of them a second, not poorer ones.
+    options.budget.rate_min_hz = 0.0;
     let mut stream = sensor.stream_with(&options).map_err(|e| failure(&e))?;
     interrupt::stops(stream.stop_handle());
     let progress = output.progress(args.count, "capturing");

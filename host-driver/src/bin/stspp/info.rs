@@ -64,7 +64,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         );
     }
     text += &super::timing::describe(&timing);
-    let json = json!({ "info": info, "status": status, "faults": faults, "timing": timing });
+    let trigger = super::timing::trigger(&sensor)?;
+    text += &trigger.as_ref().map_or(String::new(), super::timing::describe_trigger);
+    let json = json!({
+        "info": info, "status": status, "faults": faults, "timing": timing, "trigger": trigger,
+    });
     output.result(&text, &json);
     Ok(())
 }

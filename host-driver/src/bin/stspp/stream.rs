@@ -5,8 +5,9 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 use stspp::error::{Missing, Timeout};
+use stspp::pipeline::BudgetPolicy;
 use stspp::report::Summary;
-use stspp::{DepthStream, Error, Sensor, StreamStats};
+use stspp::{DepthStream, Error, Sensor, StreamStats, TriggerSource};
 
 use crate::exit::{Failure, Kind};
 use crate::interrupt;
@@ -30,6 +31,10 @@ pub struct Args {
     /// When the sensor is unplugged or restarts, wait so long for it and go on.
     #[arg(long, value_name = "SECONDS")]
     reconnect: Option<f64>,
+    /// On a machine that makes fewer depth frames a second than this, quality is lowered (first-order
+    /// subsets), and that is counted; 0 never lowers it.
+    #[arg(long, value_name = "HZ", default_value_t = BudgetPolicy::default().rate_min_hz)]
+    min_rate: f64,
     #[command(flatten)]
     matching: Matching,
 }
@@ -56,27 +61,43 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let Some(wait) = wait else {
         return Err(Failure::new(Kind::Usage, "--reconnect: expected a number of seconds"));
     };
+    if !(args.min_rate >= 0.0 && args.min_rate.is_finite()) {
+        return Err(Failure::new(Kind::Usage, "--min-rate: expected a number of frames a second"));
+    }
+    let mut options = stream_options(Some(&args.source), Some(&args.matching));
+    options.budget.rate_min_hz = args.min_rate;
     let mut shown = 0;
     loop {
         let left = args.count.map(|count| count - shown);
         let outcome = if args.pairs {
             pairs(&mut sensor, &args.source, left, &mut shown, output)
         } else {
-            show(
-                &mut sensor,
-                &stream_options(Some(&args.source), Some(&args.matching)),
-                left,
-                &mut shown,
-                output,
-            )
+            show(&mut sensor, &options, left, &mut shown, output)
         };
-        let Err(End::Lost(error)) = outcome else { return outcome.map_err(End::into_failure) };
+        let Err(End::Lost(error)) = outcome else {
+            outcome.map_err(End::into_failure)?;
+            return edges(&sensor, &args.source, output);
+        };
         if wait.is_zero() {
             return Err(failure(&error));
         }
         eprintln!("warning: {error}; waiting for the sensor");
-        resume(&mut sensor, wait)?;
+        resume(&mut sensor, &args.source, wait)?;
     }
+}
+
+/// What came of the edges at trigger-in, where they started the slots.
+fn edges(sensor: &Sensor, source: &Source, output: &Output) -> Result<(), Failure> {
+    if !matches!(source.trigger, Some(TriggerSource::External(_))) {
+        return Ok(());
+    }
+    let input = sensor.trigger_input().map_err(|e| failure(&e))?;
+    if output.json {
+        println!("{}", json!({ "trigger": input }));
+    } else {
+        print!("{}", crate::timing::describe_trigger(&input));
+    }
+    Ok(())
 }
 
 /// How a stream ended early.
@@ -110,12 +131,15 @@ impl From<Failure> for End {
 }
 
 /// Waits up to `wait` until the sensor and its cameras are there again.
-fn resume(sensor: &mut Sensor, wait: Duration) -> Result<(), Failure> {
+fn resume(sensor: &mut Sensor, source: &Source, wait: Duration) -> Result<(), Failure> {
     let deadline = Instant::now() + wait;
     loop {
         let left = deadline.saturating_duration_since(Instant::now());
         // A camera that is still missing shows when the stream is started.
-        let back = sensor.reconnect(left).and_then(|()| sensor.try_start());
+        let back = sensor
+            .reconnect(left)
+            .and_then(|()| source.set_again(sensor))
+            .and_then(|()| sensor.try_start());
         interrupt::check()?;
         match back {
             Ok(()) => return Ok(()),

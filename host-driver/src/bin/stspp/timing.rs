@@ -4,7 +4,8 @@ use std::fmt::Write;
 use std::path::PathBuf;
 
 use serde_json::json;
-use stspp::{ProjectionTiming, Slot};
+use stspp::{Error, ProjectionTiming, Sensor, Slot, TriggerInput};
+use stspp_protocol::reply::RequestError;
 
 use crate::exit::{Failure, Kind};
 use crate::output::Output;
@@ -113,12 +114,35 @@ pub fn describe(timing: &ProjectionTiming) -> String {
     text
 }
 
+/// What starts slots; `None` where the device has no trigger-in.
+pub fn trigger(sensor: &Sensor) -> Result<Option<TriggerInput>, Failure> {
+    match sensor.trigger_input() {
+        Ok(input) => Ok(Some(input)),
+        Err(Error::Refused { source: RequestError::Unsupported, .. }) => Ok(None),
+        Err(error) => Err(failure(&error)),
+    }
+}
+
+/// The trigger for people.
+pub fn describe_trigger(input: &TriggerInput) -> String {
+    let mut text = format!("trigger   {}", input.source);
+    if input.edges_taken > 0 || input.edges_ignored > 0 {
+        let (taken, ignored) = (input.edges_taken, input.edges_ignored);
+        let _ = write!(text, "; {taken} edges started a slot, {ignored} came too soon");
+    }
+    text + "\n"
+}
+
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     match &args.verb {
         Verb::Get { source } => {
-            let timing = source.open()?.timing().map_err(|e| failure(&e))?;
-            output.result(&describe(&timing), &json!({ "timing": timing }));
+            let sensor = source.open()?;
+            let timing = sensor.timing().map_err(|e| failure(&e))?;
+            let trigger = trigger(&sensor)?;
+            let text =
+                describe(&timing) + &trigger.as_ref().map_or(String::new(), describe_trigger);
+            output.result(&text, &json!({ "timing": timing, "trigger": trigger }));
             Ok(())
         }
         Verb::Set(args) => set(args, output),

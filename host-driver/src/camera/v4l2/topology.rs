@@ -89,9 +89,11 @@ pub enum SensorCameras {
 
 /// The cameras that hang nearest to the control interface at `control_usb_path`.
 ///
-/// A sensor has a hub inside, so that its parts share all ports but the last. One camera that says
-/// "left" in its product string and one that says "right" are that, whatever else is there; otherwise,
-/// of two cameras, the lower port is left. A single camera is taken for one that delivers both pictures.
+/// A sensor has a hub inside, so that its parts share all ports but the last. A USB 3 hub is two hubs to
+/// the kernel, one on each bus: the control interface is at the one for slow devices, fast cameras at
+/// its twin. One camera that says "left" in its product string and one that says "right" are that,
+/// whatever else is there; otherwise, of two cameras, the lower port is left. A single camera is taken
+/// for one that delivers both pictures.
 ///
 /// # Errors
 /// The number of cameras found, when that is neither one nor two.
@@ -99,10 +101,23 @@ pub fn cameras_of(
     control_usb_path: Option<&str>,
     cameras: &[UsbCamera],
 ) -> Result<SensorCameras, usize> {
+    cameras_at(control_usb_path, cameras, |hub| twin_in(Path::new("/sys/bus/usb/devices"), hub))
+}
+
+fn cameras_at(
+    control_usb_path: Option<&str>,
+    cameras: &[UsbCamera],
+    twin: impl Fn(&str) -> Option<String>,
+) -> Result<SensorCameras, usize> {
     let near = match control_usb_path {
         Some(control) => {
             let hub = hub_of(control);
-            cameras.iter().filter(|c| hub_of(&c.usb_path) == hub).collect::<Vec<_>>()
+            let twin = twin(hub);
+            let is_near = |camera: &&UsbCamera| {
+                let other = hub_of(&camera.usb_path);
+                other == hub || Some(other) == twin.as_deref()
+            };
+            cameras.iter().filter(is_near).collect::<Vec<_>>()
         }
         None => cameras.iter().collect(),
     };
@@ -125,6 +140,18 @@ pub fn cameras_of(
 /// A USB path without its last port: `1-2.3` is at hub `1-2`, `1-2` at hub `1`.
 fn hub_of(usb_path: &str) -> &str {
     usb_path.rsplit_once(['.', '-']).map_or("", |(hub, _)| hub)
+}
+
+/// The hub that shares its housing with `hub`, on the bus of the other speed: where the kernel says that
+/// the ports that both hang at are one socket.
+fn twin_in(devices: &Path, hub: &str) -> Option<String> {
+    let port = fs::canonicalize(devices.join(hub).join("port/peer")).ok()?;
+    // `usb2-port3` is port 3 of the root hub of bus 2, `2-3-port1` is port 1 of the hub at `2-3`.
+    let (parent, number) = port.file_name()?.to_str()?.rsplit_once("-port")?;
+    Some(match parent.strip_prefix("usb") {
+        Some(bus) => format!("{bus}-{number}"),
+        None => format!("{parent}.{number}"),
+    })
 }
 
 fn port_numbers(usb_path: &str) -> Vec<u32> {
@@ -160,6 +187,34 @@ mod tests {
         assert_eq!(cameras_of(Some("2-2.1"), &all), Ok(SensorCameras::SideBySide(all[3].clone())));
         assert_eq!(cameras_of(Some("4-1"), &all), Err(0));
         assert_eq!(cameras_of(None, &all), Err(4));
+    }
+
+    #[test]
+    fn fast_cameras_are_at_the_twin_of_the_sensors_hub() {
+        let all = [camera("2-4.1", "IR"), camera("2-4.2", "IR"), camera("2-1.1", "webcam")];
+        let twin = |hub: &str| (hub == "1-2").then(|| "2-4".to_owned());
+        let found = cameras_at(Some("1-2.3"), &all, twin).unwrap();
+        assert_eq!(found, SensorCameras::Two { left: all[0].clone(), right: all[1].clone() });
+        assert_eq!(cameras_at(Some("1-2.3"), &all, |_| None), Err(0));
+    }
+
+    #[test]
+    fn twins_are_read_as_the_kernel_lays_them_out() {
+        let folder = std::env::temp_dir().join(format!("stspp-peers-{}", std::process::id()));
+        for (hub, port, peer) in
+            [("1-2", "usb1-port2", "usb2-port4"), ("1-2.3", "1-2-port3", "2-4-port3")]
+        {
+            let at = folder.join("ports").join(port);
+            let other = folder.join("ports").join(peer);
+            fs::create_dir_all(folder.join(hub)).unwrap();
+            fs::create_dir_all(&at).unwrap();
+            fs::create_dir_all(&other).unwrap();
+            std::os::unix::fs::symlink(&other, at.join("peer")).unwrap();
+            std::os::unix::fs::symlink(&at, folder.join(hub).join("port")).unwrap();
+        }
+        let twins = ["1-2", "1-2.3", "1-7"].map(|hub| twin_in(&folder, hub));
+        fs::remove_dir_all(&folder).unwrap();
+        assert_eq!(twins, [Some("2-4".to_owned()), Some("2-4.3".to_owned()), None]);
     }
 
     #[test]
