@@ -1,5 +1,5 @@
 //! Boards of discs: dark spots, their outlines as ellipses, their grid, and the three hollow ones that
-//! tell where the board begins.
+//! tell where the board begins. A plain grid, without hollow discs, is taken when it is seen whole.
 
 use nalgebra::Vector2;
 use rayon::prelude::*;
@@ -62,9 +62,9 @@ pub fn detect(gray: &Gray, board: &Board) -> Result<Detection, Problem> {
     if best.len() < 6 {
         return Err(Problem::NoBoard { corners: points.len() });
     }
-    let index_of = placed(&spots, &best, board)?;
+    let placement = placed(&spots, &points, &best, board)?;
     let inside: Vec<(usize, usize)> =
-        best.iter().filter_map(|(cell, spot)| Some((index_of(*cell)?, *spot))).collect();
+        best.iter().filter_map(|(cell, spot)| Some((placement.point(*cell)?, *spot))).collect();
     let strays = best.len() - inside.len();
     if strays > inside.len() / 4 {
         return Err(Problem::OtherBoard { markers: strays });
@@ -212,18 +212,48 @@ fn seed_vectors(points: &[Vector2<f64>], seed: usize) -> Option<[Vector2<f64>; 2
     Some(if first.perp(&second) > 0.0 { [first, second] } else { [first, -second] })
 }
 
-/// The board's point index of each cell, from the hollow discs.
+/// Where the board lies on the lattice.
+struct Placement {
+    /// A cell, and the column and row that it is on the board.
+    cell: Cell,
+    column: i32,
+    row: i32,
+    /// Steps on the lattice along the board's columns and rows.
+    along: Cell,
+    down: Cell,
+    /// Size of the board.
+    columns: i32,
+    rows: i32,
+}
+
+impl Placement {
+    /// Index of the board's point in a cell; `None` beside the board.
+    fn point(&self, cell: Cell) -> Option<usize> {
+        let d = minus(cell, self.cell);
+        let column = self.column + d.0 * self.along.0 + d.1 * self.along.1;
+        let row = self.row + d.0 * self.down.0 + d.1 * self.down.1;
+        let inside = (0..self.columns).contains(&column) && (0..self.rows).contains(&row);
+        inside.then(|| (row * self.columns + column) as usize)
+    }
+}
+
+fn minus(p: Cell, q: Cell) -> Cell {
+    (p.0 - q.0, p.1 - q.1)
+}
+
+/// Where the board lies, from the hollow discs, or from the outline when there are none.
 fn placed(
     spots: &[Spot],
+    points: &[Vector2<f64>],
     lattice: &Lattice,
     board: &Board,
-) -> Result<impl Fn(Cell) -> Option<usize>, Problem> {
+) -> Result<Placement, Problem> {
     let hollow: Vec<Cell> =
         lattice.iter().filter(|(_, spot)| spots[**spot].is_hollow).map(|(cell, _)| *cell).collect();
     let [a, b, c] = hollow[..] else {
-        return Err(Problem::NoOrigin { hollow: hollow.len() });
+        let plain = if hollow.is_empty() { placed_whole(points, lattice, board) } else { None };
+        return plain.ok_or(Problem::NoOrigin { hollow: hollow.len() });
     };
-    let minus = |p: Cell, q: Cell| (p.0 - q.0, p.1 - q.1);
     let mut found = None;
     let mut is_mirrored = false;
     for [corner, long, short] in [[a, b, c], [a, c, b], [b, a, c], [b, c, a], [c, a, b], [c, b, a]]
@@ -251,12 +281,86 @@ fn placed(
         });
     };
     let [(column, row), ..] = board.hollow();
-    let (columns, rows) = (board.columns as i32, board.rows as i32);
-    Ok(move |cell: Cell| {
-        let d = minus(cell, corner);
-        let column = column as i32 + d.0 * x.0 + d.1 * x.1;
-        let row = row as i32 + d.0 * y.0 + d.1 * y.1;
-        let inside = (0..columns).contains(&column) && (0..rows).contains(&row);
-        inside.then(|| (row * columns + column) as usize)
+    Ok(Placement {
+        cell: corner,
+        column: column as i32,
+        row: row as i32,
+        along: x,
+        down: y,
+        columns: board.columns as i32,
+        rows: board.rows as i32,
     })
+}
+
+/// Where a plain grid lies that is seen whole, by its outline: `None` for a part of one, or for one as
+/// high as wide. Half a turn of such a board changes nothing but the numbers of its points; both cameras,
+/// which stand upright beside each other, must only choose alike. So its rows run to the right and rather
+/// up than down: nobody holds a board just along the line where that choice tips over.
+fn placed_whole(points: &[Vector2<f64>], lattice: &Lattice, board: &Board) -> Option<Placement> {
+    let (columns, rows) = (board.columns as i32, board.rows as i32);
+    let first = (lattice.keys().map(|c| c.0).min()?, lattice.keys().map(|c| c.1).min()?);
+    let last = (lattice.keys().map(|c| c.0).max()?, lattice.keys().map(|c| c.1).max()?);
+    let size = (last.0 - first.0 + 1, last.1 - first.1 + 1);
+    let is_whole = lattice.len() == board.columns * board.rows;
+    // The lattice's directions are right-handed, and so are the board's: a quarter or half turns only.
+    let (along, down, end) = match size {
+        _ if !is_whole || columns == rows => return None,
+        size if size == (columns, rows) => ((1, 0), (0, 1), (last.0, first.1)),
+        size if size == (rows, columns) => ((0, 1), (-1, 0), (last.0, last.1)),
+        _ => return None,
+    };
+    let start = if along == (1, 0) { first } else { (last.0, first.1) };
+    let row = points[*lattice.get(&end)?] - points[*lattice.get(&start)?];
+    let (cell, along, down) = if row.x - 0.5 * row.y > 0.0 {
+        (start, along, down)
+    } else {
+        let opposite = (first.0 + last.0 - start.0, first.1 + last.1 - start.1);
+        (opposite, (-along.0, -along.1), (-down.0, -down.1))
+    };
+    Some(Placement { cell, column: 0, row: 0, along, down, columns, rows })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A lattice whose own directions are turned by `quarters` against a 6 x 5 grid in the image, which
+    /// itself is rolled by `roll` radians.
+    fn grid(quarters: u32, roll: f64) -> (Vec<Vector2<f64>>, Lattice) {
+        let mut points = Vec::new();
+        let mut lattice = Lattice::new();
+        for row in 0..5 {
+            for column in 0..6 {
+                let (x, y) = (20.0 * f64::from(column), 20.0 * f64::from(row));
+                let mut cell = (column, row);
+                for _ in 0..quarters {
+                    cell = (cell.1, -cell.0);
+                }
+                lattice.insert((cell.0 + 7, cell.1 - 3), points.len());
+                let (sin, cos) = roll.sin_cos();
+                points.push(Vector2::new(cos * x - sin * y, sin * x + cos * y));
+            }
+        }
+        (points, lattice)
+    }
+
+    #[test]
+    fn a_plain_grid_seen_whole_is_numbered_alike_however_it_was_found() {
+        let board: Board = "circles:6x5:20".parse().expect("a board");
+        for quarters in 0..4 {
+            for (roll, is_turned) in
+                [(0.0, false), (0.7, false), (1.5, true), (3.1, true), (-1.5, false)]
+            {
+                let (points, lattice) = grid(quarters, roll);
+                let placement = placed_whole(&points, &lattice, &board).expect("whole");
+                for (cell, &index) in &lattice {
+                    let expected = if is_turned { 29 - index } else { index };
+                    assert_eq!(placement.point(*cell), Some(expected), "{quarters} {roll}");
+                }
+            }
+        }
+        let (points, mut lattice) = grid(0, 0.0);
+        lattice.pop_first();
+        assert!(placed_whole(&points, &lattice, &board).is_none());
+    }
 }

@@ -77,8 +77,10 @@ pub enum Problem {
         /// Corners found.
         corners: usize,
     },
-    /// A grid of discs without its three hollow ones.
-    #[error("a grid of discs with {hollow} hollow ones in view: expected three in an L")]
+    /// A grid of discs without its three hollow ones, nor a plain grid that is seen whole.
+    #[error(
+        "a grid of discs with {hollow} hollow ones in view: expected three in an L, or none and the whole grid"
+    )]
     NoOrigin {
         /// Hollow discs found.
         hollow: usize,
