@@ -61,8 +61,11 @@ fn scene(random: &mut Random) -> Vec<Point3<f64>> {
 #[test]
 fn planes_spheres_and_spacings_are_measured() {
     let folder = Folder::new("cli-measure");
-    let cloud = write(&folder.path("scene.ply"), &scene(&mut Random(3)));
+    let cloud = write(&folder.path("cloud.ply"), &scene(&mut Random(3)));
     let plane = json(&["measure", "plane", &cloud]);
+    // The folder of a result stands for its cloud.
+    let result = cloud.strip_suffix("cloud.ply").unwrap();
+    assert_eq!(json(&["measure", "plane", result]), plane);
     assert!(plane["rms_mm"].as_f64().unwrap() < 1e-3, "{plane}");
     assert!((plane["point_m"][2].as_f64().unwrap() - 1.2).abs() < 1e-6, "{plane}");
     let arguments = ["measure", "spheres", &cloud, "--diameter-mm", "80", "--spacing-mm", "219.9"];

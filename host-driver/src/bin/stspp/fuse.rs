@@ -14,6 +14,7 @@ use stspp::{PointCloud, Recording};
 
 use crate::exit::{Failure, Kind};
 use crate::interrupt;
+use crate::measure::input::cloud_of_result;
 use crate::measure::numbers;
 use crate::output::Output;
 use crate::reconstruct::{Matching, output_failure, reconstruct_failure};
@@ -172,6 +173,7 @@ fn parameters(args: &Args) -> Result<FuseParams, Failure> {
 /// Reads a view: a cloud as it is, a recording reconstructed.
 fn view(path: &Path, region: &Region, args: &Args) -> Result<View, Failure> {
     let input = |e: &dyn std::fmt::Display| Failure::new(Kind::Input, e);
+    let path = &cloud_of_result(path);
     let name = path.display().to_string();
     let mut cloud = if path.is_dir() {
         let failed = |e: ReconstructError| reconstruct_failure(&e);

@@ -20,7 +20,7 @@ use crate::source::{Source, failure, stream_options};
 /// Options of all that is measured.
 #[derive(clap::Args)]
 pub struct Input {
-    /// Point cloud (.ply), recording folder, or source (sim:SCENE, usb:, replay:FOLDER).
+    /// Point cloud (.ply), recording folder, folder of a result, or source (sim:SCENE, usb:, replay:FOLDER).
     pub input: String,
     /// Measure in a box only: x0,y0,z0,x1,y1,z1 in metres of the left camera's frame.
     #[arg(
@@ -79,7 +79,7 @@ impl Input {
         if self.count == 0 {
             return Err(Failure::new(Kind::Usage, "--count is 0: expected at least 1"));
         }
-        let path = Path::new(&self.input);
+        let path = &cloud_of_result(Path::new(&self.input));
         if path.is_dir() {
             return self.recording(path, output);
         }
@@ -172,6 +172,13 @@ impl Loaded {
         };
         points.map_err(|e| Failure::new(Kind::Input, e))
     }
+}
+
+/// The cloud in a folder that `reconstruct`, `capture` or `demo` wrote; any other path as it is. Such a
+/// folder has no calibration of the raw pictures: it is no recording.
+pub fn cloud_of_result(path: &Path) -> PathBuf {
+    let cloud = path.join("cloud.ply");
+    if cloud.is_file() && !path.join("camchain.yaml").exists() { cloud } else { path.to_owned() }
 }
 
 /// Reads a cloud, refuses empty ones and other units.
