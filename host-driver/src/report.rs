@@ -123,7 +123,7 @@ pub fn of_reconstruction(source: &str, reconstruction: &Reconstruction) -> Value
     let matching: Vec<Value> = frame
         .stages
         .iter()
-        .map(|stage| json!({ "stage": stage.stage, "wall_ms": stage.wall_ms }))
+        .map(|stage| json!({ "stage": stage.stage, "wall_ms": stage.wall_ms, "cpu_ms": stage.cpu_ms }))
         .collect();
     let mut report = json!({
         "versions": versions_json(),

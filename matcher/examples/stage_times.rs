@@ -5,6 +5,7 @@
 use stspp_matcher::{
     DisparityRange, Image, Level, ShapeFunction,
     coarse::{Coarse, CoarseMap, INVALID},
+    cpu_time::process_cpu_ms,
     dense::{
         DenseFit, DenseMaps, mark_steps, motion::MotionFit, order::OrderChoice, settle::Settle,
     },
@@ -13,10 +14,7 @@ use stspp_matcher::{
 };
 
 fn cpu_ms() -> f64 {
-    let mut t = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: `t` is a valid timespec.
-    unsafe { libc::clock_gettime(libc::CLOCK_PROCESS_CPUTIME_ID, &mut t) };
-    t.tv_sec as f64 * 1e3 + t.tv_nsec as f64 / 1e6
+    process_cpu_ms().expect("a clock of the process's CPU time")
 }
 
 fn main() {

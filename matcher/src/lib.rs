@@ -11,6 +11,7 @@ pub mod census;
 pub mod check;
 pub mod coarse;
 pub mod cost;
+pub mod cpu_time;
 pub mod dense;
 pub mod error;
 mod fast;

@@ -9,6 +9,9 @@ pub struct StageTime {
     pub stage: &'static str,
     /// Wall time in milliseconds.
     pub wall_ms: f64,
+    /// CPU time of the whole process in milliseconds, where the system tells it: of the matcher alone only
+    /// where nothing else runs.
+    pub cpu_ms: Option<f64>,
 }
 
 /// Disparity and similarity of one stereo stack, on the left rectified canvas.

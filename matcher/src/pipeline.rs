@@ -6,6 +6,7 @@ use crate::{
     Error, Image, Level, Matched, Method, Params, ShapeFunction, StageTime, StereoStack,
     census::{PaddedStack, Side},
     check,
+    cpu_time::process_cpu_ms,
     dense::{DenseMaps, order::OrderChoice},
     fast::Fast,
     icgn::{field::Field, guess::CoarseMap, prepare::Prepared},
@@ -183,6 +184,7 @@ impl Matcher {
 /// Times the stages of a frame.
 struct Clock {
     last: Instant,
+    cpu_ms: Option<f64>,
     stages: Vec<StageTime>,
 }
 
@@ -190,13 +192,14 @@ impl Clock {
     /// Times a frame, in the memory of another one's times.
     fn start(mut stages: Vec<StageTime>) -> Self {
         stages.clear();
-        Self { last: Instant::now(), stages }
+        Self { last: Instant::now(), cpu_ms: process_cpu_ms(), stages }
     }
 
     fn stage(&mut self, stage: &'static str) {
-        let now = Instant::now();
+        let (now, now_ms) = (Instant::now(), process_cpu_ms());
         let wall_ms = (now - self.last).as_secs_f64() * 1e3;
-        self.stages.push(StageTime { stage, wall_ms });
-        self.last = now;
+        let cpu_ms = now_ms.zip(self.cpu_ms).map(|(now, before)| now - before);
+        self.stages.push(StageTime { stage, wall_ms, cpu_ms });
+        (self.last, self.cpu_ms) = (now, now_ms);
     }
 }

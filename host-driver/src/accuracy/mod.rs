@@ -3,6 +3,7 @@
 
 pub mod capture;
 pub mod maps;
+pub mod resampling;
 pub mod score;
 pub mod tables;
 pub mod truth;

@@ -7,6 +7,8 @@ mod calibration;
 #[cfg(feature = "sim")]
 mod check;
 mod icp;
+#[cfg(feature = "sim")]
+mod resampling;
 mod timing;
 
 use clap::Subcommand;
@@ -33,6 +35,8 @@ enum What {
     Calibration(calibration::Args),
     #[cfg(feature = "sim")]
     Check(check::Args),
+    #[cfg(feature = "sim")]
+    Resampling(resampling::Args),
 }
 
 /// Runs the verb.
@@ -45,6 +49,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         Some(What::Calibration(args)) => calibration::run(args, output),
         #[cfg(feature = "sim")]
         Some(What::Check(args)) => check::run(args, output),
+        #[cfg(feature = "sim")]
+        Some(What::Resampling(args)) => resampling::run(args, output),
         None => timing::run(&args.timing, output),
     }
 }

@@ -10,7 +10,7 @@ pub fn of(source: &str, frame: &DepthFrame, matching: &MatchInfo, stats: &Stream
     let stages: Vec<Value> = frame
         .stages
         .iter()
-        .map(|stage| json!({ "stage": stage.stage, "wall_ms": stage.wall_ms }))
+        .map(|stage| json!({ "stage": stage.stage, "wall_ms": stage.wall_ms, "cpu_ms": stage.cpu_ms }))
         .collect();
     json!({
         "versions": report::versions_json(),

@@ -104,7 +104,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         let inner: Vec<Step> = matched
             .stages
             .iter()
-            .map(|s| Step { stage: format!("match/{}", s.stage), wall_ms: s.wall_ms, cpu_ms: None })
+            .map(|s| Step {
+                stage: format!("match/{}", s.stage),
+                wall_ms: s.wall_ms,
+                cpu_ms: s.cpu_ms,
+            })
             .collect();
         let lefts: Vec<_> = stack.left.iter().collect();
         let intensity = reproject::mean_intensity(&lefts);
