@@ -12,6 +12,7 @@
 //!
 //! All windows share one warp and separable sums. phi is 1, x, y or 1, x, y, x^2, xy, y^2.
 
+mod ahead;
 pub(crate) mod gradient;
 pub mod kernels;
 pub(crate) mod moments;

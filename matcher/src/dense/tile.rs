@@ -10,6 +10,7 @@
 //! ```
 
 use super::{
+    ahead::Ahead,
     gradient::{Static, static_row},
     moments::{PAD, Powers, horizontal, powers, slide_sum},
     motion::Motion,
@@ -120,6 +121,7 @@ pub(crate) struct Tile {
     /// Column sums of the eight maps that windows sum, sliding down.
     columns: [Aligned<f32>; 8],
     flagged: Aligned<f32>,
+    ahead: Ahead,
     powers: Powers,
     w0: Ring,
     /// Static sums.
@@ -313,7 +315,7 @@ impl Tile {
             return;
         }
         w0[PAD..PAD + x1 - x0].copy_from_slice(&job.start.row(y as usize)[x0..x1]);
-        prefetch(job, y as usize + 1, x0, x1);
+        self.ahead.begin(job, y as usize + 1, (x0, x1));
         let words = self.words_at(y, job.radius);
         let left = image_rows(job.left, y);
         let mut out = Static {
@@ -327,6 +329,7 @@ impl Tile {
             ll: self.ll.inner_mut(y),
         };
         static_row(job.level, &left[..job.left.len()], x0, self.len, &mut out);
+        self.ahead.some(job);
         let right = image_rows(job.right, y);
         let source = Source {
             right: &right[..job.right.len()],
@@ -339,8 +342,10 @@ impl Tile {
         let motion =
             job.motion.and_then(|m| m.of_row(y as usize, (x0, x1), self.len, &mut self.rate));
         warp(job.level, &source, motion, &mut self.moving, &mut self.first.warped(y, false));
+        self.ahead.some(job);
         let valid = self.first.valid.row(y);
         product_row(job.level, self.l.row(y), valid, self.len, self.l_used.row_mut(y));
+        self.ahead.some(job);
         product_row(job.level, self.ll.row(y), valid, self.len, self.ll_used.row_mut(y));
     }
 
@@ -368,11 +373,13 @@ impl Tile {
         for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums).zip(columns) {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
             slide_sum(level, (enters, leaves), r, len, column, sum.row_mut(y));
+            self.ahead.some(job);
         }
         let [n, l, ll, g, gg] = &self.sums;
         let windowed =
             Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
         gain_row(level, &windowed, job.frames, len, self.ratio.row_mut(y), self.offset.row_mut(y));
+        self.ahead.some(job);
         let used = self.s_used.row_mut(y);
         product_row(level, self.s.row(y), self.first.valid.row(y), len, used);
         self.residual(job, y, false);
@@ -383,6 +390,7 @@ impl Tile {
         let mut out = self.hs.each_mut().map(|h| h.row_mut(y));
         let s = self.s_used.row(y);
         horizontal(level, s, r, &self.powers, len, &mut out[..moments]);
+        self.ahead.some(job);
     }
 
     /// q of row `y` and its horizontal moments, of the first or the second warp.
@@ -407,8 +415,10 @@ impl Tile {
             origin: job.origin,
         };
         residual_row(job.level, &terms, self.len, pass.q.row_mut(y));
+        self.ahead.some(job);
         let mut out = pass.hq.each_mut().map(|h| h.row_mut(y));
         horizontal(job.level, pass.q.row(y), job.radius, &self.powers, self.len, &mut out);
+        self.ahead.some(job);
     }
 
     /// M^-1 and the first fit of row `y`, then the second warp there.
@@ -418,12 +428,14 @@ impl Tile {
         around_all(&self.hs, y, r, |s| {
             inverse_rows(level, s, r, &self.powers, len, job.fits, &mut inverse);
         });
+        self.ahead.some(job);
         self.fits(job, y, x0, inside, false);
         let w0 = self.w0.row(y);
         // The start is a whole pixel, perhaps the wrong neighbour: a fit farther off is not this
         // surface's.
         let bounds = (job.origin, 2.0);
         restart_row(level, self.fit[0].row(y), w0, bounds, len, self.w1.row_mut(y));
+        self.ahead.some(job);
         if !inside {
             self.second.clear(y);
         } else {
@@ -441,6 +453,7 @@ impl Tile {
             let motion =
                 job.motion.and_then(|m| m.of_row(y as usize, columns, len, &mut self.rate));
             warp(level, &source, motion, &mut self.moving, &mut self.second.warped(y, true));
+            self.ahead.some(job);
         }
     }
 
@@ -454,12 +467,14 @@ impl Tile {
         for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums_again).zip(columns) {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
             slide_sum(level, (enters, leaves), r, len, column, sum.row_mut(y));
+            self.ahead.some(job);
         }
         let ([n, l, ll, ..], [g, gg, lg]) = (&self.sums, &self.sums_again);
         let windowed =
             Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
         let (ratio, offset) = (self.ratio.row_mut(y), self.offset.row_mut(y));
         gain_row(level, &windowed, job.frames, len, ratio, offset);
+        self.ahead.some(job);
         zncc_row(level, &windowed, lg.row(y), job.frames, len, self.zncc.row_mut(y));
         self.residual(job, y, true);
     }
@@ -490,6 +505,7 @@ impl Tile {
         around_all(&pass.hq, y, r, |q| {
             disparities(level, q, &inverse, r, &self.powers, len, &mut out[..count]);
         });
+        self.ahead.some(job);
         if !inside {
             return;
         }
@@ -526,29 +542,6 @@ fn warp(
         None => warp_row(level, source, out),
         Some(motion) => moving::warp_moving_row(level, source, &motion, scratch, out),
     }
-}
-
-/// Asks for the samples that the next row will need: twenty images are more streams than the
-/// processor follows by itself.
-fn prefetch(job: &Job<'_>, y: usize, x0: usize, x1: usize) {
-    #[cfg(target_arch = "x86_64")]
-    if y < job.start.height() {
-        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        let width = job.start.width() as isize;
-        // The right image's part lies about the mean disparity to the left.
-        for (images, shift) in [(job.left, 0), (job.right, job.origin as isize)] {
-            let from = (x0 as isize - shift).clamp(0, width) as usize;
-            let to = (x1 as isize - shift).clamp(0, width) as usize;
-            for image in &images[..job.frames] {
-                for line in image.row(y)[from..to].chunks(32) {
-                    // SAFETY: a hint about memory that the slice holds.
-                    unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
-                }
-            }
-        }
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = (job, y, x0, x1);
 }
 
 /// Row `y` of each image.
