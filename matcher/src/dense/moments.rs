@@ -168,118 +168,90 @@ fn box_lanes<V: Lanes>(
     across::<V>(radius, len, column, out);
 }
 
-/// Horizontal moments of one padded row: `out[k][i]` = sum over j of (j / radius)^k row[i + j].
-pub(crate) fn horizontal(
-    level: Level,
-    row: &[f32],
-    radius: usize,
-    powers: &Powers,
-    len: usize,
-    out: &mut [&mut [f32]],
-) {
-    let padded = len + 2 * PAD;
-    assert!(radius <= PAD && len.is_multiple_of(WIDEST) && row.len() >= padded);
-    assert!(out.iter().all(|o| o.len() >= padded));
-    match out.len() {
-        3 => dispatch!(
-            level,
-            horizontal3(
-                row: &[f32] = row,
-                radius: usize = radius,
-                powers: &Powers = powers,
-                len: usize = len,
-                out: &mut [&mut [f32]] = out,
-            )
-        ),
-        5 => dispatch!(
-            level,
-            horizontal5(
-                row: &[f32] = row,
-                radius: usize = radius,
-                powers: &Powers = powers,
-                len: usize = len,
-                out: &mut [&mut [f32]] = out,
-            )
-        ),
-        k => unreachable!("{k} moments"),
+/// Columns whose vertical moments are at hand at a time: they stay in the first-level cache.
+pub(crate) const CHUNK: usize = 256;
+
+/// Vertical moments of a chunk's columns, and of [`PAD`] on both sides.
+#[repr(align(64))]
+pub(crate) struct Columns<const K: usize>([[f32; CHUNK + 2 * PAD]; K]);
+
+impl<const K: usize> Columns<K> {
+    pub(crate) fn new() -> Self {
+        Self([[0.0; CHUNK + 2 * PAD]; K])
     }
-}
 
-#[inline(always)]
-fn horizontal3<V: Lanes>(
-    row: &[f32],
-    radius: usize,
-    powers: &Powers,
-    len: usize,
-    out: &mut [&mut [f32]],
-) {
-    horizontal_lanes::<V, 3>(row, radius, powers, len, out);
-}
-
-#[inline(always)]
-fn horizontal5<V: Lanes>(
-    row: &[f32],
-    radius: usize,
-    powers: &Powers,
-    len: usize,
-    out: &mut [&mut [f32]],
-) {
-    horizontal_lanes::<V, 5>(row, radius, powers, len, out);
-}
-
-#[inline(always)]
-#[allow(clippy::needless_range_loop)]
-fn horizontal_lanes<V: Lanes, const K: usize>(
-    row: &[f32],
-    radius: usize,
-    powers: &Powers,
-    len: usize,
-    out: &mut [&mut [f32]],
-) {
-    for i in (PAD..PAD + len).step_by(V::COUNT) {
-        // SAFETY: `i + COUNT <= PAD + len`.
-        let load = |at: usize| unsafe { V::load(row.as_ptr().add(at)) };
-        let mut h = [V::splat(0.0); K];
-        h[0] = load(i);
-        for j in 1..=radius {
-            // `i - radius >= 0` and `i + radius + COUNT <= len + 2 PAD`.
-            let (after, before) = (load(i + j), load(i - j));
-            let (even, odd) = (after.add(before), after.sub(before));
-            h[0] = h[0].add(even);
-            for k in 1..K {
-                let with = if k % 2 == 0 { even } else { odd };
-                h[k] = with.mul_add(V::splat(powers[k][j]), h[k]);
+    /// Fills the columns around the `count` pixels from column `at` of padded rows; a chunk follows the
+    /// one before, of [`CHUNK`] pixels, or begins a row at [`PAD`].
+    ///
+    /// `R` is the radius known to the compiler, or 0.
+    ///
+    /// # Safety
+    /// `at + count + PAD` lies within every row, `count` is a multiple of COUNT and at most [`CHUNK`], and
+    /// there are 2 `radius` + 1 rows.
+    #[inline(always)]
+    pub(crate) unsafe fn fill<V: Lanes, const R: usize>(
+        &mut self,
+        rows: &[&[f32]],
+        radius: usize,
+        powers: &Powers,
+        at: usize,
+        count: usize,
+    ) {
+        let begun = if at == PAD {
+            0
+        } else {
+            for columns in &mut self.0 {
+                columns.copy_within(CHUNK.., 0);
+            }
+            2 * PAD
+        };
+        for i in (begun..count + 2 * PAD).step_by(V::COUNT) {
+            // SAFETY: the caller's promise.
+            let load = |row: usize| unsafe {
+                V::load(rows.get_unchecked(row).as_ptr().add(at - PAD + i))
+            };
+            let m: [V; K] = weighted::<V, K, R>(load, radius, powers);
+            for (columns, m) in self.0.iter_mut().zip(m) {
+                // SAFETY: `i + COUNT <= count + 2 PAD`.
+                unsafe { m.store(columns.as_mut_ptr().add(i)) };
             }
         }
-        for (o, h) in out.iter_mut().zip(h) {
-            // SAFETY: as above.
-            unsafe { h.store(o.as_mut_ptr().add(i)) };
-        }
+    }
+
+    /// Moments along x, of power 0 to L - 1, of the vertical moment `power`, at pixel `i` of the chunk.
+    ///
+    /// # Safety
+    /// `i + COUNT` is at most the chunk's count; `power` is below K.
+    #[inline(always)]
+    pub(crate) unsafe fn across<V: Lanes, const L: usize, const R: usize>(
+        &self,
+        power: usize,
+        radius: usize,
+        powers: &Powers,
+        i: usize,
+    ) -> [V; L] {
+        let radius = if R == 0 { radius } else { R };
+        // SAFETY: the caller's promise; the radius is at most PAD.
+        let load = |j: usize| unsafe {
+            V::load(self.0.get_unchecked(power).as_ptr().add(PAD + i - radius + j))
+        };
+        weighted::<V, L, R>(load, radius, powers)
     }
 }
 
-/// Vertical moments at pixel `i` of horizontal moments `k`: `m[l]` = sum over j of
-/// (j / radius)^l rows[radius + j][i].
-///
-/// `R` is the radius known to the compiler, or 0.
-///
-/// # Safety
-/// `i + COUNT` lies within every row, and there are 2 `radius` + 1 rows.
+/// m[l] = sum over j of (j / radius)^l value(radius + j).
 #[inline(always)]
 #[allow(clippy::needless_range_loop)]
-pub(crate) unsafe fn vertical<V: Lanes, const L: usize, const R: usize>(
-    rows: &[&[f32]],
+fn weighted<V: Lanes, const L: usize, const R: usize>(
+    value: impl Fn(usize) -> V,
     radius: usize,
     powers: &Powers,
-    i: usize,
 ) -> [V; L] {
     let radius = if R == 0 { radius } else { R };
-    // SAFETY: the caller's promise.
-    let load = |row: usize| unsafe { V::load(rows.get_unchecked(row).as_ptr().add(i)) };
     let mut m = [V::splat(0.0); L];
-    m[0] = load(radius);
+    m[0] = value(radius);
     for j in 1..=radius {
-        let (after, before) = (load(radius + j), load(radius - j));
+        let (after, before) = (value(radius + j), value(radius - j));
         let even = after.add(before);
         m[0] = m[0].add(even);
         if L > 1 {
@@ -298,8 +270,86 @@ mod tests {
     use super::*;
     use crate::synthetic::Random;
 
+    /// x moments up to 2 of the y moments up to 2, by chunks.
+    fn moments<V: Lanes>(
+        rows: &[&[f32]],
+        radius: usize,
+        powers: &Powers,
+        len: usize,
+        out: &mut [[[f32; 3]; 3]],
+    ) {
+        let mut columns = Columns::<3>::new();
+        for at in (PAD..PAD + len).step_by(CHUNK) {
+            let count = CHUNK.min(PAD + len - at);
+            // SAFETY: rows hold `len + 2 PAD` values.
+            unsafe { columns.fill::<V, 0>(rows, radius, powers, at, count) };
+            for i in (0..count).step_by(V::COUNT) {
+                for power in 0..3 {
+                    // SAFETY: as above.
+                    let m = unsafe { columns.across::<V, 3, 0>(power, radius, powers, i) };
+                    for (a, m) in m.into_iter().enumerate() {
+                        let mut lanes = [0.0f32; WIDEST];
+                        // SAFETY: COUNT is at most WIDEST.
+                        unsafe { m.store(lanes.as_mut_ptr()) };
+                        for (lane, v) in lanes[..V::COUNT].iter().enumerate() {
+                            out[at - PAD + i + lane][a][power] = *v;
+                        }
+                    }
+                }
+            }
+        }
+    }
+
     #[test]
-    fn boxes_and_moments_match_the_definition_at_every_level() {
+    fn moments_match_the_definition_at_every_level() {
+        let mut random = Random::new(6);
+        for (radius, len) in [(2usize, 48), (4, 2 * CHUNK + 32), (8, CHUNK + 16)] {
+            let rows: Vec<Vec<f32>> = (0..2 * radius + 1)
+                .map(|_| {
+                    let mut row = vec![0.0; len + 2 * PAD];
+                    row[PAD..PAD + len - 7].fill_with(|| random.unit() as f32 * 1000.0);
+                    row
+                })
+                .collect();
+            let rows: Vec<&[f32]> = rows.iter().map(|r| &r[..]).collect();
+            let powers = powers(radius);
+            for level in Level::available() {
+                let mut got = vec![[[0.0; 3]; 3]; len];
+                dispatch!(
+                    level,
+                    moments(
+                        rows: &[&[f32]] = &rows,
+                        radius: usize = radius,
+                        powers: &Powers = &powers,
+                        len: usize = len,
+                        out: &mut [[[f32; 3]; 3]] = &mut got,
+                    )
+                );
+                for (i, got) in got.iter().enumerate() {
+                    for (a, got) in got.iter().enumerate() {
+                        for (b, got) in got.iter().enumerate() {
+                            let unit = |j: usize| (j as f64 - radius as f64) / radius as f64;
+                            let side = 0..=2 * radius;
+                            let want: f64 = side
+                                .clone()
+                                .flat_map(|y| side.clone().map(move |x| (x, y)))
+                                .map(|(x, y)| {
+                                    unit(x).powi(a as i32)
+                                        * unit(y).powi(b as i32)
+                                        * f64::from(rows[y][PAD + i + x - radius])
+                                })
+                                .sum();
+                            let off = (f64::from(*got) - want).abs();
+                            assert!(off < 0.05, "{level} {radius} {i} x^{a} y^{b}: {got}, {want}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn boxes_match_the_definition_at_every_level() {
         let mut random = Random::new(5);
         for radius in [2usize, 4, 8] {
             let len = 48;
@@ -311,14 +361,10 @@ mod tests {
                 })
                 .collect();
             let rows: Vec<&[f32]> = rows.iter().map(|r| &r[..]).collect();
-            let powers = powers(radius);
             for level in Level::available() {
                 let mut column = vec![0.0; len + 2 * PAD];
                 let mut out = column.clone();
                 box_sum(level, &rows, radius, len, &mut column, &mut out);
-                let mut h: Vec<Vec<f32>> = vec![vec![0.0; len + 2 * PAD]; 5];
-                let mut to: Vec<&mut [f32]> = h.iter_mut().map(|h| &mut h[..]).collect();
-                horizontal(level, rows[0], radius, &powers, len, &mut to);
                 for i in PAD..PAD + len {
                     let want: f64 = rows
                         .iter()
@@ -327,15 +373,6 @@ mod tests {
                         })
                         .sum();
                     assert!((f64::from(out[i]) - want).abs() < 1e-6 * want.abs() + 1e-9);
-                    for (k, h) in h.iter().enumerate() {
-                        let want: f64 = (0..=2 * radius)
-                            .map(|j| {
-                                let t = (j as f64 - radius as f64) / radius as f64;
-                                t.powi(k as i32) * f64::from(rows[0][i + j - radius])
-                            })
-                            .sum();
-                        assert!((f64::from(h[i]) - want).abs() < 0.01, "{level} {radius} {k}");
-                    }
                 }
             }
         }

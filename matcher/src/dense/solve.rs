@@ -1,14 +1,13 @@
 //! The fit: the first row of M^-1 from the moments of S, and the disparity from the moments of q.
+//!
+//! Moments are summed along y first, straight from the rows of S and q: what is kept between rows is one
+//! map each instead of one per moment.
 
-use super::moments::{PAD, Powers, vertical};
+use super::moments::{CHUNK, Columns, PAD, Powers};
 use crate::{
     Level,
     lanes::{Lanes, WIDEST, dispatch},
 };
-
-/// Rows of horizontal moments around an output row: `rows[k]` holds 2 radius + 1 padded rows of the
-/// k-th moment.
-pub(crate) type MomentRows<'a, const K: usize> = [&'a [&'a [f32]]; K];
 
 /// Parameters of the first-order fit that are stored: those of 1, x, y.
 pub(crate) const FIRST: usize = 3;
@@ -129,11 +128,11 @@ pub(crate) enum Fits {
     Both,
 }
 
-/// Writes first rows of M^-1: `rows[0..3]` for x, y, 1 of the first order, `rows[3..9]` for
-/// x, y, x^2, xy, y^2, 1 of the second (padded rows).
+/// Writes first rows of M^-1 to padded rows: `rows[0..3]` for x, y, 1 of the first order, `rows[3..9]` for
+/// x, y, x^2, xy, y^2, 1 of the second. `s` holds the 2 `radius` + 1 padded rows of S around the row.
 pub(crate) fn inverse_rows(
     level: Level,
-    s: MomentRows<'_, 5>,
+    s: &[&[f32]],
     radius: usize,
     powers: &Powers,
     len: usize,
@@ -141,20 +140,15 @@ pub(crate) fn inverse_rows(
     rows: &mut [&mut [f32]],
 ) {
     let padded = len + 2 * PAD;
-    let (moments, count) = match fits {
-        Fits::First => (3, FIRST),
-        Fits::Both => (5, FIRST + SECOND),
-    };
-    assert!(len.is_multiple_of(WIDEST) && rows.len() >= count);
-    for rows in &s[..moments] {
-        assert!(rows.len() == 2 * radius + 1 && rows.iter().all(|r| r.len() >= padded));
-    }
+    let count = if fits == Fits::First { FIRST } else { FIRST + SECOND };
+    assert!(len.is_multiple_of(WIDEST) && rows.len() >= count && radius <= PAD);
+    assert!(s.len() == 2 * radius + 1 && s.iter().all(|r| r.len() >= padded));
     assert!(rows.iter().all(|r| r.len() >= padded));
     match fits {
         Fits::First => dispatch!(
             level,
             inverse_first_any(
-                s: MomentRows<'_, 5> = s,
+                s: &[&[f32]] = s,
                 radius: usize = radius,
                 powers: &Powers = powers,
                 len: usize = len,
@@ -164,7 +158,7 @@ pub(crate) fn inverse_rows(
         Fits::Both => dispatch!(
             level,
             inverse_both_any(
-                s: MomentRows<'_, 5> = s,
+                s: &[&[f32]] = s,
                 radius: usize = radius,
                 powers: &Powers = powers,
                 len: usize = len,
@@ -176,76 +170,86 @@ pub(crate) fn inverse_rows(
 
 #[inline(always)]
 fn inverse_first<V: Lanes, const R: usize>(
-    s: MomentRows<'_, 5>,
+    s: &[&[f32]],
     radius: usize,
     powers: &Powers,
     len: usize,
     rows: &mut [&mut [f32]],
 ) {
-    for i in (PAD..PAD + len).step_by(V::COUNT) {
+    let mut columns = Columns::<3>::new();
+    for at in (PAD..PAD + len).step_by(CHUNK) {
+        let count = CHUNK.min(PAD + len - at);
         // SAFETY: checked by `inverse_rows`.
-        let (m0, m1, m2) = unsafe {
-            (
-                vertical::<V, 3, R>(s[0], radius, powers, i),
-                vertical::<V, 2, R>(s[1], radius, powers, i),
-                vertical::<V, 1, R>(s[2], radius, powers, i),
-            )
-        };
-        let zero = V::splat(0.0);
-        let first = inverse_row(first_matrix(&[m0, [m1[0], m1[1], zero], [m2[0], zero, zero]]));
-        for (row, v) in rows.iter_mut().zip(first) {
-            // SAFETY: as above.
-            unsafe { v.store(row.as_mut_ptr().add(i)) };
+        unsafe { columns.fill::<V, R>(s, radius, powers, at, count) };
+        for i in (0..count).step_by(V::COUNT) {
+            // SAFETY: as above. Powers of x at y^0, y^1 and y^2.
+            let (y0, y1, y2) = unsafe {
+                (
+                    columns.across::<V, 3, R>(0, radius, powers, i),
+                    columns.across::<V, 2, R>(1, radius, powers, i),
+                    columns.across::<V, 1, R>(2, radius, powers, i),
+                )
+            };
+            let zero = V::splat(0.0);
+            let moments = [[y0[0], y1[0], y2[0]], [y0[1], y1[1], zero], [y0[2], zero, zero]];
+            for (row, v) in rows.iter_mut().zip(inverse_row(first_matrix(&moments))) {
+                // SAFETY: as above.
+                unsafe { v.store(row.as_mut_ptr().add(at + i)) };
+            }
         }
     }
 }
 
 #[inline(always)]
 fn inverse_both<V: Lanes, const R: usize>(
-    s: MomentRows<'_, 5>,
+    s: &[&[f32]],
     radius: usize,
     powers: &Powers,
     len: usize,
     rows: &mut [&mut [f32]],
 ) {
-    for i in (PAD..PAD + len).step_by(V::COUNT) {
+    let (to_first, to_second) = rows.split_at_mut(FIRST);
+    let mut columns = Columns::<5>::new();
+    for at in (PAD..PAD + len).step_by(CHUNK) {
+        let count = CHUNK.min(PAD + len - at);
         // SAFETY: checked by `inverse_rows`.
-        let (m0, m1, m2, m3, m4) = unsafe {
-            (
-                vertical::<V, 5, R>(s[0], radius, powers, i),
-                vertical::<V, 4, R>(s[1], radius, powers, i),
-                vertical::<V, 3, R>(s[2], radius, powers, i),
-                vertical::<V, 2, R>(s[3], radius, powers, i),
-                vertical::<V, 1, R>(s[4], radius, powers, i),
-            )
-        };
-        let z = V::splat(0.0);
-        let moments = [
-            m0,
-            [m1[0], m1[1], m1[2], m1[3], z],
-            [m2[0], m2[1], m2[2], z, z],
-            [m3[0], m3[1], z, z, z],
-            [m4[0], z, z, z, z],
-        ];
-        let first = inverse_row(first_matrix(&moments));
-        let second = inverse_row(second_matrix(&moments));
-        let (to_first, to_second) = rows.split_at_mut(FIRST);
-        for (row, v) in to_first.iter_mut().zip(first) {
-            // SAFETY: as above.
-            unsafe { v.store(row.as_mut_ptr().add(i)) };
-        }
-        for (row, v) in to_second.iter_mut().zip(second) {
-            // SAFETY: as above.
-            unsafe { v.store(row.as_mut_ptr().add(i)) };
+        unsafe { columns.fill::<V, R>(s, radius, powers, at, count) };
+        for i in (0..count).step_by(V::COUNT) {
+            // SAFETY: as above. Powers of x at y^0 to y^4.
+            let (y0, y1, y2, y3, y4) = unsafe {
+                (
+                    columns.across::<V, 5, R>(0, radius, powers, i),
+                    columns.across::<V, 4, R>(1, radius, powers, i),
+                    columns.across::<V, 3, R>(2, radius, powers, i),
+                    columns.across::<V, 2, R>(3, radius, powers, i),
+                    columns.across::<V, 1, R>(4, radius, powers, i),
+                )
+            };
+            let z = V::splat(0.0);
+            let moments = [
+                [y0[0], y1[0], y2[0], y3[0], y4[0]],
+                [y0[1], y1[1], y2[1], y3[1], z],
+                [y0[2], y1[2], y2[2], z, z],
+                [y0[3], y1[3], z, z, z],
+                [y0[4], z, z, z, z],
+            ];
+            for (row, v) in to_first.iter_mut().zip(inverse_row(first_matrix(&moments))) {
+                // SAFETY: as above.
+                unsafe { v.store(row.as_mut_ptr().add(at + i)) };
+            }
+            for (row, v) in to_second.iter_mut().zip(inverse_row(second_matrix(&moments))) {
+                // SAFETY: as above.
+                unsafe { v.store(row.as_mut_ptr().add(at + i)) };
+            }
         }
     }
 }
 
-/// Disparities (without the origin) from the moments of q and rows of M^-1 as [`inverse_rows`] gives
-/// them: `out[0]` of first order, `out[1]`, when there, of second.
+/// Disparities (without the origin) from the 2 `radius` + 1 rows of q around the row and rows of M^-1 as
+/// [`inverse_rows`] gives them: `out[0]` of first order, `out[1]`, when there, of second.
 pub(crate) fn disparities(
     level: Level,
-    q: MomentRows<'_, 3>,
+    q: &[&[f32]],
     inverse: &[&[f32]],
     radius: usize,
     powers: &Powers,
@@ -255,14 +259,12 @@ pub(crate) fn disparities(
     let padded = len + 2 * PAD;
     let count = if out.len() == 1 { FIRST } else { FIRST + SECOND };
     assert!(len.is_multiple_of(WIDEST) && inverse.len() >= count && !out.is_empty());
-    for rows in q {
-        assert!(rows.len() == 2 * radius + 1 && rows.iter().all(|r| r.len() >= padded));
-    }
+    assert!(radius <= PAD && q.len() == 2 * radius + 1 && q.iter().all(|r| r.len() >= padded));
     assert!(inverse.iter().all(|r| r.len() >= padded) && out.iter().all(|r| r.len() >= padded));
     dispatch!(
         level,
         disparities_any(
-            q: MomentRows<'_, 3> = q,
+            q: &[&[f32]] = q,
             inverse: &[&[f32]] = inverse,
             radius: usize = radius,
             powers: &Powers = powers,
@@ -274,42 +276,81 @@ pub(crate) fn disparities(
 
 #[inline(always)]
 fn disparities_lanes<V: Lanes, const R: usize>(
-    q: MomentRows<'_, 3>,
+    q: &[&[f32]],
     inverse: &[&[f32]],
     radius: usize,
     powers: &Powers,
     len: usize,
     out: &mut [&mut [f32]],
 ) {
-    let both = out.len() > 1;
-    for i in (PAD..PAD + len).step_by(V::COUNT) {
-        // SAFETY: checked by `disparities`.
-        let row = |k: usize| unsafe { V::load(inverse.get_unchecked(k).as_ptr().add(i)) };
-        // SAFETY: as above.
-        let (q0, q1, q2) = unsafe {
-            (
-                vertical::<V, 3, R>(q[0], radius, powers, i),
-                vertical::<V, 2, R>(q[1], radius, powers, i),
-                vertical::<V, 1, R>(q[2], radius, powers, i),
-            )
-        };
-        let first = row(0).mul_add(q1[0], row(1).mul_add(q0[1], row(2).mul(q0[0])));
-        // SAFETY: as above.
-        unsafe { first.store(out[0].as_mut_ptr().add(i)) };
-        if both {
-            let slopes = row(3).mul_add(q1[0], row(4).mul_add(q0[1], row(8).mul(q0[0])));
-            let curves = row(6).mul_add(q1[1], row(7).mul(q0[2]));
-            let second = row(5).mul_add(q2[0], slopes.add(curves));
-            // SAFETY: as above.
-            unsafe { second.store(out[1].as_mut_ptr().add(i)) };
+    match out {
+        [first] => {
+            let mut columns = Columns::<2>::new();
+            for at in (PAD..PAD + len).step_by(CHUNK) {
+                let count = CHUNK.min(PAD + len - at);
+                // SAFETY: checked by `disparities`.
+                unsafe { columns.fill::<V, R>(q, radius, powers, at, count) };
+                for i in (0..count).step_by(V::COUNT) {
+                    // SAFETY: as above.
+                    unsafe {
+                        let y0 = columns.across::<V, 2, R>(0, radius, powers, i);
+                        let y1 = columns.across::<V, 1, R>(1, radius, powers, i);
+                        let d = first_order(inverse, at + i, &y0, &y1);
+                        d.store(first.as_mut_ptr().add(at + i));
+                    }
+                }
+            }
         }
+        [first, second, ..] => {
+            let mut columns = Columns::<3>::new();
+            for at in (PAD..PAD + len).step_by(CHUNK) {
+                let count = CHUNK.min(PAD + len - at);
+                // SAFETY: checked by `disparities`.
+                unsafe { columns.fill::<V, R>(q, radius, powers, at, count) };
+                for i in (0..count).step_by(V::COUNT) {
+                    // SAFETY: as above.
+                    unsafe {
+                        let y0 = columns.across::<V, 3, R>(0, radius, powers, i);
+                        let y1 = columns.across::<V, 2, R>(1, radius, powers, i);
+                        let y2 = columns.across::<V, 1, R>(2, radius, powers, i);
+                        let d = first_order(inverse, at + i, &y0, &y1);
+                        d.store(first.as_mut_ptr().add(at + i));
+                        let row = |k: usize| {
+                            V::load(inverse.get_unchecked(k).as_ptr().add(at + i))
+                        };
+                        let slopes = row(3)
+                            .mul_add(y0[1], row(4).mul_add(y1[0], row(8).mul(y0[0])));
+                        let curves = row(6).mul_add(y1[1], row(7).mul(y2[0]));
+                        let d = row(5).mul_add(y0[2], slopes.add(curves));
+                        d.store(second.as_mut_ptr().add(at + i));
+                    }
+                }
+            }
+        }
+        [] => {}
     }
+}
+
+/// The first-order disparity from moments along x at y^0 and y^1.
+///
+/// # Safety
+/// `i + COUNT` lies within the first three rows of `inverse`.
+#[inline(always)]
+unsafe fn first_order<V: Lanes, const A: usize, const B: usize>(
+    inverse: &[&[f32]],
+    i: usize,
+    y0: &[V; A],
+    y1: &[V; B],
+) -> V {
+    // SAFETY: the caller's promise.
+    let row = |k: usize| unsafe { V::load(inverse.get_unchecked(k).as_ptr().add(i)) };
+    row(0).mul_add(y0[1], row(1).mul_add(y1[0], row(2).mul(y0[0])))
 }
 
 /// The paper's radius is compiled for itself, all others together.
 #[inline(always)]
 fn inverse_first_any<V: Lanes>(
-    s: MomentRows<'_, 5>,
+    s: &[&[f32]],
     radius: usize,
     powers: &Powers,
     len: usize,
@@ -323,7 +364,7 @@ fn inverse_first_any<V: Lanes>(
 
 #[inline(always)]
 fn inverse_both_any<V: Lanes>(
-    s: MomentRows<'_, 5>,
+    s: &[&[f32]],
     radius: usize,
     powers: &Powers,
     len: usize,
@@ -337,7 +378,7 @@ fn inverse_both_any<V: Lanes>(
 
 #[inline(always)]
 fn disparities_any<V: Lanes>(
-    q: MomentRows<'_, 3>,
+    q: &[&[f32]],
     inverse: &[&[f32]],
     radius: usize,
     powers: &Powers,

@@ -3,16 +3,16 @@
 //!
 //! ```text
 //! y      gradients and sums of the left row, warp at the start w0
-//! y - r  gain and offset, q, horizontal moments of q and S
+//! y - r  gain and offset, q
 //! y - 2r M^-1, first fit w1, warp at w1
-//! y - 3r gain and offset, q, moments again; ZNCC
+//! y - 3r gain and offset, q again; ZNCC
 //! y - 4r second fit
 //! ```
 
 use super::{
     ahead::Ahead,
     gradient::{Static, static_row},
-    moments::{PAD, Powers, horizontal, powers, slide_sum},
+    moments::{PAD, Powers, powers, slide_sum},
     motion::Motion,
     normalise::{Terms, Windowed, gain_row, product_row, residual_row, restart_row, zncc_row},
     refit::{Window, refit_row},
@@ -98,19 +98,6 @@ fn around<T>(ring: &Ring, y: isize, radius: usize, work: impl FnOnce(&[&[f32]]) 
     work(&rows[..2 * radius + 1])
 }
 
-/// The rows of several rings around `y`.
-fn around_all<const K: usize, T>(
-    rings: &[Ring; K],
-    y: isize,
-    radius: usize,
-    work: impl FnOnce([&[&[f32]]; K]) -> T,
-) -> T {
-    let rows: [[&[f32]; ROWS]; K] = std::array::from_fn(|k| {
-        std::array::from_fn(|j| rings[k].row(y - radius as isize + j.min(2 * radius) as isize))
-    });
-    work(std::array::from_fn(|k| &rows[k][..2 * radius + 1]))
-}
-
 /// Buffers of a tile, kept between tiles.
 #[derive(Debug, Default)]
 pub(crate) struct Tile {
@@ -138,7 +125,6 @@ pub(crate) struct Tile {
     ratio: Ring,
     offset: Ring,
     s_used: Ring,
-    hs: [Ring; 5],
     inverse: [Ring; FIRST + SECOND],
     w1: Ring,
     second: Pass,
@@ -153,7 +139,7 @@ pub(crate) struct Tile {
     moving: moving::Scratch,
 }
 
-/// A warp's terms, and q with its horizontal moments.
+/// A warp's terms, and q.
 #[derive(Debug, Default)]
 struct Pass {
     at: Ring,
@@ -163,7 +149,6 @@ struct Pass {
     gg: Ring,
     lg: Ring,
     q: Ring,
-    hq: [Ring; 3],
 }
 
 impl Pass {
@@ -171,7 +156,7 @@ impl Pass {
         for ring in [&mut self.valid, &mut self.g, &mut self.gg, &mut self.lg] {
             ring.resize(stride, window + 1);
         }
-        for ring in [&mut self.at, &mut self.ig, &mut self.q].into_iter().chain(&mut self.hq) {
+        for ring in [&mut self.at, &mut self.ig, &mut self.q] {
             ring.resize(stride, window);
         }
     }
@@ -222,7 +207,7 @@ impl Tile {
         for ring in [&mut self.l_used, &mut self.ll_used] {
             ring.resize(stride, window + 1);
         }
-        for ring in self.hs.iter_mut().chain(&mut self.sums) {
+        for ring in &mut self.sums {
             ring.resize(stride, window);
         }
         for ring in [&mut self.ratio, &mut self.offset] {
@@ -364,7 +349,7 @@ impl Tile {
         }
     }
 
-    /// Gain and offset, q, and horizontal moments of row `y`.
+    /// Gain and offset, and q of row `y`.
     fn normalise(&mut self, job: &Job<'_>, y: isize) {
         let (level, r, len) = (job.level, job.radius, self.len);
         let terms = [&self.first.valid, &self.l_used, &self.ll_used, &self.first.g, &self.first.gg];
@@ -383,17 +368,9 @@ impl Tile {
         let used = self.s_used.row_mut(y);
         product_row(level, self.s.row(y), self.first.valid.row(y), len, used);
         self.residual(job, y, false);
-        let moments = match job.fits {
-            Fits::First => 3,
-            Fits::Both => 5,
-        };
-        let mut out = self.hs.each_mut().map(|h| h.row_mut(y));
-        let s = self.s_used.row(y);
-        horizontal(level, s, r, &self.powers, len, &mut out[..moments]);
-        self.ahead.some(job);
     }
 
-    /// q of row `y` and its horizontal moments, of the first or the second warp.
+    /// q of row `y`, of the first or the second warp.
     fn residual(&mut self, job: &Job<'_>, y: isize, again: bool) {
         let (pass, w) = match again {
             false => (&mut self.first, &self.w0),
@@ -416,16 +393,13 @@ impl Tile {
         };
         residual_row(job.level, &terms, self.len, pass.q.row_mut(y));
         self.ahead.some(job);
-        let mut out = pass.hq.each_mut().map(|h| h.row_mut(y));
-        horizontal(job.level, pass.q.row(y), job.radius, &self.powers, self.len, &mut out);
-        self.ahead.some(job);
     }
 
     /// M^-1 and the first fit of row `y`, then the second warp there.
     fn first_fit(&mut self, job: &Job<'_>, y: isize, x0: usize, inside: bool) {
         let (level, r, len) = (job.level, job.radius, self.len);
         let mut inverse = self.inverse.each_mut().map(|h| h.row_mut(y));
-        around_all(&self.hs, y, r, |s| {
+        around(&self.s_used, y, r, |s| {
             inverse_rows(level, s, r, &self.powers, len, job.fits, &mut inverse);
         });
         self.ahead.some(job);
@@ -457,7 +431,7 @@ impl Tile {
         }
     }
 
-    /// Gain and offset, q, horizontal moments and ZNCC of row `y` from the second warp: the first
+    /// Gain and offset, q and ZNCC of row `y` from the second warp: the first
     /// one, at whole pixels, leaves the gain uncertain by a part in a hundred.
     fn normalise_again(&mut self, job: &Job<'_>, y: isize) {
         let (level, r, len) = (job.level, job.radius, self.len);
@@ -502,7 +476,7 @@ impl Tile {
         let count = if fits == Fits::First { 1 } else { 2 };
         let inverse = self.inverse.each_ref().map(|h| h.row(y));
         let mut out = self.fit.each_mut().map(|h| h.row_mut(y));
-        around_all(&pass.hq, y, r, |q| {
+        around(&pass.q, y, r, |q| {
             disparities(level, q, &inverse, r, &self.powers, len, &mut out[..count]);
         });
         self.ahead.some(job);
