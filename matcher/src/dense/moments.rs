@@ -21,19 +21,19 @@ pub(crate) fn powers(radius: usize) -> Powers {
 
 /// Moves the sums over a column of rows on by one, and sums 2 `radius` + 1 of them per pixel:
 /// `column` += `enters` - `leaves`. Exact, and so independent of where the sliding began, as long as
-/// the values are whole numbers and a column's sum is below 2^24.
+/// the values are whole numbers and a window's sum is below 2^24. `threes` is scratch.
 pub(crate) fn slide_sum(
     level: Level,
     (enters, leaves): (&[f32], &[f32]),
     radius: usize,
     len: usize,
-    column: &mut [f32],
+    (column, threes): (&mut [f32], &mut [f32]),
     out: &mut [f32],
 ) {
     let padded = len + 2 * PAD;
-    assert!(radius <= PAD && len.is_multiple_of(WIDEST));
+    assert!((1..=PAD).contains(&radius) && len.is_multiple_of(WIDEST));
     assert!(enters.len() >= padded && leaves.len() >= padded);
-    assert!(column.len() >= padded && out.len() >= padded);
+    assert!(column.len() >= padded && threes.len() >= padded && out.len() >= padded);
     dispatch!(
         level,
         slide_lanes(
@@ -42,6 +42,7 @@ pub(crate) fn slide_sum(
             radius: usize = radius,
             len: usize = len,
             column: &mut [f32] = column,
+            threes: &mut [f32] = threes,
             out: &mut [f32] = out,
         )
     );
@@ -68,17 +69,25 @@ pub(crate) fn slide_columns(
     );
 }
 
-/// The second half: sums 2 `radius` + 1 columns per pixel.
-pub(crate) fn across_sum(level: Level, column: &[f32], radius: usize, len: usize, out: &mut [f32]) {
+/// The second half: sums 2 `radius` + 1 columns per pixel. `threes` is scratch.
+pub(crate) fn across_sum(
+    level: Level,
+    column: &[f32],
+    radius: usize,
+    len: usize,
+    threes: &mut [f32],
+    out: &mut [f32],
+) {
     let padded = len + 2 * PAD;
-    assert!(radius <= PAD && len.is_multiple_of(WIDEST));
-    assert!(column.len() >= padded && out.len() >= padded);
+    assert!((1..=PAD).contains(&radius) && len.is_multiple_of(WIDEST));
+    assert!(column.len() >= padded && threes.len() >= padded && out.len() >= padded);
     dispatch!(
         level,
         across(
             radius: usize = radius,
             len: usize = len,
             column: &[f32] = column,
+            threes: &mut [f32] = threes,
             out: &mut [f32] = out,
         )
     );
@@ -102,18 +111,55 @@ fn slide_lanes<V: Lanes>(
     radius: usize,
     len: usize,
     column: &mut [f32],
+    threes: &mut [f32],
     out: &mut [f32],
 ) {
     columns_lanes::<V>(enters, leaves, len, column);
-    across::<V>(radius, len, column, out);
+    across::<V>(radius, len, column, threes, out);
 }
 
-/// Sums over columns.
+/// Sums over columns: of three, then of threes, which takes six loads a pixel for nine columns.
 #[inline(always)]
-fn across<V: Lanes>(radius: usize, len: usize, column: &[f32], out: &mut [f32]) {
+fn across<V: Lanes>(
+    radius: usize,
+    len: usize,
+    column: &[f32],
+    threes: &mut [f32],
+    out: &mut [f32],
+) {
+    // All that fit, the last of them over the one before.
+    let last = len + 2 * PAD - 2 - V::COUNT;
+    for i in (0..last).step_by(V::COUNT).chain([last]) {
+        // SAFETY: `i + 2 + COUNT <= len + 2 PAD`.
+        unsafe {
+            let load = |at: usize| V::load(column.as_ptr().add(at));
+            load(i).add(load(i + 1)).add(load(i + 2)).store(threes.as_mut_ptr().add(i));
+        }
+    }
+    match radius {
+        4 => across_threes::<V, 4>(radius, len, column, threes, out),
+        _ => across_threes::<V, 0>(radius, len, column, threes, out),
+    }
+}
+
+#[inline(always)]
+fn across_threes<V: Lanes, const R: usize>(
+    radius: usize,
+    len: usize,
+    column: &[f32],
+    threes: &[f32],
+    out: &mut [f32],
+) {
+    let radius = if R == 0 { radius } else { R };
+    let side = 2 * radius + 1;
     for i in (PAD..PAD + len).step_by(V::COUNT) {
         let mut sum = V::splat(0.0);
-        for j in 0..2 * radius + 1 {
+        for three in 0..side / 3 {
+            // SAFETY: the last three begin two before the window's last column at most, so that
+            // `i + radius - 2 + COUNT <= len + 2 PAD - 2`.
+            sum = sum.add(unsafe { V::load(threes.as_ptr().add(i - radius + 3 * three)) });
+        }
+        for j in side / 3 * 3..side {
             // SAFETY: `i - radius >= 0` and `i + radius + COUNT <= len + 2 PAD`.
             sum = sum.add(unsafe { V::load(column.as_ptr().add(i - radius + j)) });
         }
@@ -122,20 +168,20 @@ fn across<V: Lanes>(radius: usize, len: usize, column: &[f32], out: &mut [f32]) 
     }
 }
 
-/// Sum over the 2 `radius` + 1 `rows` and as many columns. All rows, `column` and `out` are padded
-/// rows of `PAD + len + PAD` values with zeros in the pads; `column` is scratch.
+/// Sum over the 2 `radius` + 1 `rows` and as many columns. All rows, `column`, `threes` and `out` are
+/// padded rows of `PAD + len + PAD` values with zeros in the pads; `column` and `threes` are scratch.
 pub(crate) fn box_sum(
     level: Level,
     rows: &[&[f32]],
     radius: usize,
     len: usize,
-    column: &mut [f32],
+    (column, threes): (&mut [f32], &mut [f32]),
     out: &mut [f32],
 ) {
     let padded = len + 2 * PAD;
-    assert!(radius <= PAD && len.is_multiple_of(WIDEST));
+    assert!((1..=PAD).contains(&radius) && len.is_multiple_of(WIDEST));
     assert!(rows.iter().all(|r| r.len() >= padded));
-    assert!(column.len() >= padded && out.len() >= padded);
+    assert!(column.len() >= padded && threes.len() >= padded && out.len() >= padded);
     dispatch!(
         level,
         box_lanes(
@@ -143,6 +189,7 @@ pub(crate) fn box_sum(
             radius: usize = radius,
             len: usize = len,
             column: &mut [f32] = column,
+            threes: &mut [f32] = threes,
             out: &mut [f32] = out,
         )
     );
@@ -154,6 +201,7 @@ fn box_lanes<V: Lanes>(
     radius: usize,
     len: usize,
     column: &mut [f32],
+    threes: &mut [f32],
     out: &mut [f32],
 ) {
     for i in (PAD..PAD + len).step_by(V::COUNT) {
@@ -165,7 +213,7 @@ fn box_lanes<V: Lanes>(
         // SAFETY: as above.
         unsafe { sum.store(column.as_mut_ptr().add(i)) };
     }
-    across::<V>(radius, len, column, out);
+    across::<V>(radius, len, column, threes, out);
 }
 
 /// Columns whose vertical moments are at hand at a time: they stay in the first-level cache.
@@ -363,8 +411,8 @@ mod tests {
             let rows: Vec<&[f32]> = rows.iter().map(|r| &r[..]).collect();
             for level in Level::available() {
                 let mut column = vec![0.0; len + 2 * PAD];
-                let mut out = column.clone();
-                box_sum(level, &rows, radius, len, &mut column, &mut out);
+                let (mut threes, mut out) = (column.clone(), column.clone());
+                box_sum(level, &rows, radius, len, (&mut column, &mut threes), &mut out);
                 for i in PAD..PAD + len {
                     let want: f64 = rows
                         .iter()

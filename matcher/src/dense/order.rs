@@ -64,6 +64,7 @@ struct Buffers {
     /// By row modulo the window: differences, their squares and validity, and first orders.
     rows: [Vec<Vec<f32>>; 4],
     column: Vec<f32>,
+    threes: Vec<f32>,
     /// Sums of the first three over the columns of the window, sliding down; begun anew in each band, so
     /// that they round the same whatever the threads.
     columns: [Vec<f32>; 3],
@@ -155,7 +156,8 @@ impl Buffers {
             rows.resize_with(SIDE, Vec::new);
         }
         let rows = self.rows.iter_mut().flatten();
-        let scratch = [&mut self.column, &mut self.nothing].into_iter().chain(&mut self.columns);
+        let scratch = [&mut self.column, &mut self.threes, &mut self.nothing];
+        let scratch = scratch.into_iter().chain(&mut self.columns);
         for row in rows.chain(scratch).chain(&mut self.sums) {
             row.resize(padded, 0.0);
             row.fill(0.0);
@@ -213,12 +215,12 @@ impl Buffers {
         // Differences, squares and validity widely; validity and first orders narrowly.
         let (wide, narrow) = self.sums.split_at_mut(3);
         for (column, sum) in self.columns.iter().zip(wide) {
-            across_sum(level, column, RADIUS, len, sum);
+            across_sum(level, column, RADIUS, len, &mut self.threes, sum);
         }
         for (rows, sum) in self.rows[2..].iter().zip(narrow) {
             let around: [&[f32]; 2 * WIDE + 1] =
                 std::array::from_fn(|j| &rows[(y + j + SIDE - WIDE) % SIDE][..]);
-            box_sum(level, &around, WIDE, len, &mut self.column, sum);
+            box_sum(level, &around, WIDE, len, (&mut self.column, &mut self.threes), sum);
         }
         let sums = self.sums.each_ref().map(|sum| &sum[PAD..PAD + out.len()]);
         let blend = Blend { first, second, sums, sigma, zncc_min };

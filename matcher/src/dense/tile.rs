@@ -107,6 +107,8 @@ pub(crate) struct Tile {
     grey: Aligned<i32>,
     /// Column sums of the eight maps that windows sum, sliding down.
     columns: [Aligned<f32>; 8],
+    /// Scratch of window sums.
+    threes: Aligned<f32>,
     flagged: Aligned<f32>,
     ahead: Ahead,
     powers: Powers,
@@ -194,6 +196,7 @@ impl Tile {
             column.resize(stride, 0.0);
             column.fill(0.0);
         }
+        self.threes.resize(stride, 0.0);
         self.flagged.resize(len, 0.0);
         self.powers = powers(radius);
         for ring in [&mut self.w0, &mut self.il, &mut self.i, &mut self.w1] {
@@ -357,7 +360,8 @@ impl Tile {
         let columns = &mut self.columns[..5];
         for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums).zip(columns) {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
-            slide_sum(level, (enters, leaves), r, len, column, sum.row_mut(y));
+            let scratch = (&mut column[..], &mut self.threes[..]);
+            slide_sum(level, (enters, leaves), r, len, scratch, sum.row_mut(y));
             self.ahead.some(job);
         }
         let [n, l, ll, g, gg] = &self.sums;
@@ -440,7 +444,8 @@ impl Tile {
         let columns = &mut self.columns[5..];
         for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums_again).zip(columns) {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
-            slide_sum(level, (enters, leaves), r, len, column, sum.row_mut(y));
+            let scratch = (&mut column[..], &mut self.threes[..]);
+            slide_sum(level, (enters, leaves), r, len, scratch, sum.row_mut(y));
             self.ahead.some(job);
         }
         let ([n, l, ll, ..], [g, gg, lg]) = (&self.sums, &self.sums_again);

@@ -17,6 +17,7 @@ pub(crate) struct Lag {
     /// Per image row: sum over time of S, and of S t (padded rows).
     rows: Vec<[Vec<f32>; 2]>,
     column: Vec<f32>,
+    threes: Vec<f32>,
     windows: [Vec<f32>; 2],
 }
 
@@ -49,6 +50,7 @@ impl Lag {
             );
         }
         self.column.resize(padded, 0.0);
+        self.threes.resize(padded, 0.0);
         for window in &mut self.windows {
             window.resize(padded, 0.0);
         }
@@ -67,7 +69,8 @@ impl Lag {
         for (k, window) in self.windows.iter_mut().enumerate() {
             let around = self.rows[y - top..=y - top + 2 * radius].iter();
             let around: Vec<&[f32]> = around.map(|sums| &sums[k][..]).collect();
-            box_sum(frame.level, &around, radius, len, &mut self.column, window);
+            let scratch = (&mut self.column[..], &mut self.threes[..]);
+            box_sum(frame.level, &around, radius, len, scratch, window);
         }
         let [s, st] = &self.windows;
         let times = s[PAD..].iter().zip(&st[PAD..]);
