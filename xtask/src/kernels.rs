@@ -109,8 +109,13 @@ fn compare(kept: &BTreeMap<String, f64>, lines: &[(f64, String)]) -> Outcome {
 /// under user-mode emulation: the NEON kernels are seen by no x86 build.
 pub fn aarch64() -> Outcome {
     const TARGET: &str = "aarch64-unknown-linux-gnu";
-    const PACKAGES: [&str; 5] =
-        ["rustc-web", "rust-web-src", "gcc-aarch64-linux-gnu", "libc6-dev-arm64-cross", "qemu-user"];
+    const PACKAGES: [&str; 5] = [
+        "rustc-web",
+        "rust-web-src",
+        "gcc-aarch64-linux-gnu",
+        "libc6-dev-arm64-cross",
+        "qemu-user",
+    ];
     if let Err(why) = debian::ensure(&PACKAGES) {
         return Outcome::Skipped(why);
     }

@@ -69,8 +69,7 @@ pub fn plane(
         (params.method, params.shape) = (setting.method, setting.shape);
         params.advanced.threads = setting.threads;
         let frame = stack.depth_frame(&mut Matcher::new(params)?, 0..frames)?;
-        let (fit_rms_mm, bias_mm) =
-            central_plane_mm(&frame, truth).unwrap_or((f64::NAN, f64::NAN));
+        let (fit_rms_mm, bias_mm) = central_plane_mm(&frame, truth).unwrap_or((f64::NAN, f64::NAN));
         let kernel = format!("{kernel:?}");
         found.push(Resampled { kernel, bits, distance_m, fit_rms_mm, bias_mm });
     }

@@ -12,7 +12,6 @@
 //!
 //! All windows share one warp and separable sums. phi is 1, x, y or 1, x, y, x^2, xy, y^2.
 
-mod ahead;
 pub(crate) mod gradient;
 pub mod kernels;
 pub(crate) mod moments;
@@ -34,8 +33,9 @@ use solve::Fits;
 pub use steps::mark_steps;
 use tile::{Job, Output, Tile};
 
-/// Columns a tile fits: its rows stay in a core's second-level cache.
-const STRIP: usize = 640;
+/// Columns a tile fits. Narrower strips would keep a tile's rows in a core's second-level cache, but cost
+/// more than that saves: memory gives short pieces of twenty images' rows slowly.
+const STRIP: usize = 2048;
 /// Fewest rows of a task: each computes some rows beyond its own anew.
 const BAND: usize = 64;
 

@@ -255,9 +255,8 @@ impl<const K: usize> Columns<K> {
         };
         for i in (begun..count + 2 * PAD).step_by(V::COUNT) {
             // SAFETY: the caller's promise.
-            let load = |row: usize| unsafe {
-                V::load(rows.get_unchecked(row).as_ptr().add(at - PAD + i))
-            };
+            let load =
+                |row: usize| unsafe { V::load(rows.get_unchecked(row).as_ptr().add(at - PAD + i)) };
             let m: [V; K] = weighted::<V, K, R>(load, radius, powers);
             for (columns, m) in self.0.iter_mut().zip(m) {
                 // SAFETY: `i + COUNT <= count + 2 PAD`.

@@ -315,11 +315,9 @@ fn disparities_lanes<V: Lanes, const R: usize>(
                         let y2 = columns.across::<V, 1, R>(2, radius, powers, i);
                         let d = first_order(inverse, at + i, &y0, &y1);
                         d.store(first.as_mut_ptr().add(at + i));
-                        let row = |k: usize| {
-                            V::load(inverse.get_unchecked(k).as_ptr().add(at + i))
-                        };
-                        let slopes = row(3)
-                            .mul_add(y0[1], row(4).mul_add(y1[0], row(8).mul(y0[0])));
+                        let row = |k: usize| V::load(inverse.get_unchecked(k).as_ptr().add(at + i));
+                        let slopes =
+                            row(3).mul_add(y0[1], row(4).mul_add(y1[0], row(8).mul(y0[0])));
                         let curves = row(6).mul_add(y1[1], row(7).mul(y2[0]));
                         let d = row(5).mul_add(y0[2], slopes.add(curves));
                         d.store(second.as_mut_ptr().add(at + i));

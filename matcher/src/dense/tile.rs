@@ -10,7 +10,6 @@
 //! ```
 
 use super::{
-    ahead::Ahead,
     gradient::{Static, static_row},
     moments::{PAD, Powers, powers, slide_sum},
     motion::Motion,
@@ -19,7 +18,7 @@ use super::{
     solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
     warp::{Source, Warped, moving, warp_row},
 };
-use crate::{Image, Level, Sample, aligned::Aligned};
+use crate::{Image, Level, Sample, aligned::Aligned, lanes::vectorised};
 
 /// What all tiles of a frame share.
 pub(crate) struct Job<'a> {
@@ -110,7 +109,6 @@ pub(crate) struct Tile {
     /// Scratch of window sums.
     threes: Aligned<f32>,
     flagged: Aligned<f32>,
-    ahead: Ahead,
     powers: Powers,
     w0: Ring,
     /// Static sums.
@@ -264,19 +262,26 @@ impl Tile {
                 self.normalise_again(job, y3);
             }
             if y4 >= top {
-                self.second_fit(job, y4, (x0, x1));
+                self.fits(job, y4, x0, true, true);
                 let from = (y4 - top) as usize * width;
                 let columns = x_from - x0 + PAD..x_to - x0 + PAD;
+                let valid = &self.second.valid.row(y4)[columns.clone()];
                 let maps = [
                     (&mut *out.first, &self.fit[0], job.origin),
-                    (&mut *out.second, &self.fit[1], job.origin),
                     (&mut *out.zncc, &self.zncc, 0.0),
+                    (&mut *out.second, &self.fit[1], job.origin),
                 ];
-                for (to, ring, origin) in maps {
-                    let values = &ring.row(y4)[columns.clone()];
-                    for (to, v) in to[from + x_from..from + x_to].iter_mut().zip(values) {
-                        *to = v + origin;
-                    }
+                let count = if job.fits == Fits::First { 2 } else { 3 };
+                for (to, ring, origin) in maps.into_iter().take(count) {
+                    vectorised!(
+                        job.level,
+                        finish_loop(
+                            values: &[f32] = &ring.row(y4)[columns.clone()],
+                            valid: &[f32] = valid,
+                            origin: f32 = origin,
+                            to: &mut [f32] = &mut to[from + x_from..from + x_to],
+                        )
+                    );
                 }
             }
         }
@@ -303,7 +308,6 @@ impl Tile {
             return;
         }
         w0[PAD..PAD + x1 - x0].copy_from_slice(&job.start.row(y as usize)[x0..x1]);
-        self.ahead.begin(job, y as usize + 1, (x0, x1));
         let words = self.words_at(y, job.radius);
         let left = image_rows(job.left, y);
         let mut out = Static {
@@ -317,7 +321,6 @@ impl Tile {
             ll: self.ll.inner_mut(y),
         };
         static_row(job.level, &left[..job.left.len()], x0, self.len, &mut out);
-        self.ahead.some(job);
         let right = image_rows(job.right, y);
         let source = Source {
             right: &right[..job.right.len()],
@@ -330,10 +333,8 @@ impl Tile {
         let motion =
             job.motion.and_then(|m| m.of_row(y as usize, (x0, x1), self.len, &mut self.rate));
         warp(job.level, &source, motion, &mut self.moving, &mut self.first.warped(y, false));
-        self.ahead.some(job);
         let valid = self.first.valid.row(y);
         product_row(job.level, self.l.row(y), valid, self.len, self.l_used.row_mut(y));
-        self.ahead.some(job);
         product_row(job.level, self.ll.row(y), valid, self.len, self.ll_used.row_mut(y));
     }
 
@@ -362,13 +363,11 @@ impl Tile {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
             let scratch = (&mut column[..], &mut self.threes[..]);
             slide_sum(level, (enters, leaves), r, len, scratch, sum.row_mut(y));
-            self.ahead.some(job);
         }
         let [n, l, ll, g, gg] = &self.sums;
         let windowed =
             Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
         gain_row(level, &windowed, job.frames, len, self.ratio.row_mut(y), self.offset.row_mut(y));
-        self.ahead.some(job);
         let used = self.s_used.row_mut(y);
         product_row(level, self.s.row(y), self.first.valid.row(y), len, used);
         self.residual(job, y, false);
@@ -396,7 +395,6 @@ impl Tile {
             origin: job.origin,
         };
         residual_row(job.level, &terms, self.len, pass.q.row_mut(y));
-        self.ahead.some(job);
     }
 
     /// M^-1 and the first fit of row `y`, then the second warp there.
@@ -406,14 +404,12 @@ impl Tile {
         around(&self.s_used, y, r, |s| {
             inverse_rows(level, s, r, &self.powers, len, job.fits, &mut inverse);
         });
-        self.ahead.some(job);
         self.fits(job, y, x0, inside, false);
         let w0 = self.w0.row(y);
         // The start is a whole pixel, perhaps the wrong neighbour: a fit farther off is not this
         // surface's.
         let bounds = (job.origin, 2.0);
         restart_row(level, self.fit[0].row(y), w0, bounds, len, self.w1.row_mut(y));
-        self.ahead.some(job);
         if !inside {
             self.second.clear(y);
         } else {
@@ -431,7 +427,6 @@ impl Tile {
             let motion =
                 job.motion.and_then(|m| m.of_row(y as usize, columns, len, &mut self.rate));
             warp(level, &source, motion, &mut self.moving, &mut self.second.warped(y, true));
-            self.ahead.some(job);
         }
     }
 
@@ -446,28 +441,14 @@ impl Tile {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
             let scratch = (&mut column[..], &mut self.threes[..]);
             slide_sum(level, (enters, leaves), r, len, scratch, sum.row_mut(y));
-            self.ahead.some(job);
         }
         let ([n, l, ll, ..], [g, gg, lg]) = (&self.sums, &self.sums_again);
         let windowed =
             Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
         let (ratio, offset) = (self.ratio.row_mut(y), self.offset.row_mut(y));
         gain_row(level, &windowed, job.frames, len, ratio, offset);
-        self.ahead.some(job);
         zncc_row(level, &windowed, lg.row(y), job.frames, len, self.zncc.row_mut(y));
         self.residual(job, y, true);
-    }
-
-    /// The second fit of row `y`, and its ZNCC.
-    fn second_fit(&mut self, job: &Job<'_>, y: isize, (x0, x1): (usize, usize)) {
-        self.fits(job, y, x0, true, true);
-        // Only pixels with a start and a warp of their own are measured.
-        let valid = &self.second.valid.row(y)[PAD..PAD + x1 - x0];
-        for ring in self.fit.iter_mut().chain([&mut self.zncc]) {
-            for (v, &valid) in ring.row_mut(y)[PAD..].iter_mut().zip(valid) {
-                *v = if valid > 0.5 { *v } else { f32::NAN };
-            }
-        }
     }
 
     /// Fits of row `y` from the first or second pass, those at steps by the masked window.
@@ -484,7 +465,6 @@ impl Tile {
         around(&pass.q, y, r, |q| {
             disparities(level, q, &inverse, r, &self.powers, len, &mut out[..count]);
         });
-        self.ahead.some(job);
         if !inside {
             return;
         }
@@ -506,6 +486,14 @@ impl Tile {
                 });
             });
         });
+    }
+}
+
+/// The result: only pixels with a start and a warp of their own are measured.
+#[inline(always)]
+fn finish_loop(values: &[f32], valid: &[f32], origin: f32, to: &mut [f32]) {
+    for ((to, v), valid) in to.iter_mut().zip(values).zip(valid) {
+        *to = if *valid > 0.5 { v + origin } else { f32::NAN };
     }
 }
 
