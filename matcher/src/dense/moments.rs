@@ -318,6 +318,7 @@ mod tests {
     use crate::synthetic::Random;
 
     /// x moments up to 2 of the y moments up to 2, by chunks.
+    #[allow(clippy::needless_range_loop)]
     fn moments<V: Lanes>(
         rows: &[&[f32]],
         radius: usize,
