@@ -212,7 +212,7 @@ fn thin_objects_are_found_nearly_as_often_as_by_brute_force() {
     let rod = |x: f64, _: f64| (x - 120.0).abs() < 1.15;
     let wire = |x: f64, y: f64| (x - y - 80.0).abs() < 1.4;
     let bar = |x: f64, y: f64| (y - 46.0).abs() < 1.5 && x > 150.0;
-    for frames in [1, 2, 3, 4, 5, 10] {
+    for frames in [1, 2, 3, 4, 5, 10, 16] {
         let layers = vec![
             Layer::everywhere(|x, _| 3.0 + 0.04 * x),
             Layer::patch(|_, _| 61.2, rod),
@@ -239,9 +239,7 @@ fn thin_objects_are_found_nearly_as_often_as_by_brute_force() {
             };
             let (cheap, all) = (good(&cheap), good(&all));
             println!("{frames} frames: {cheap} of the {all} pixels that brute force finds");
-            // With many frames a wrong disparity of the background can be too good to be doubted.
-            let least = if frames > 5 { 0.8 } else { 0.95 };
-            assert!(cheap as f64 >= least * all as f64, "{frames} frames: {cheap} of {all}");
+            assert!(cheap as f64 >= 0.95 * all as f64, "{frames} frames: {cheap} of {all}");
         });
     }
 }

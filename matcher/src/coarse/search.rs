@@ -229,7 +229,8 @@ fn search_block(scene: &Scene<'_>, seeds: &[i16], x: usize, s: &mut Scratch, out
     s.fresh.clear(count);
     let mut found = 0;
     for row in (0..rows).step_by(2) {
-        for column in (0..BLOCK.min(out.width - x)).step_by(2) {
+        // Rows in turn look at even and at odd columns: a wire aslant may lie on one kind alone.
+        for column in (row / 2 % 2..BLOCK.min(out.width - x)).step_by(2) {
             if u32::from(out.cost[row * out.width + x + column]) <= UNSURE_COST {
                 continue;
             }

@@ -50,8 +50,10 @@ fn tests(frames: usize) -> [Test; 64] {
     let at = |dx, dy| (0..frames).map(move |frame| Test::Mean { dx, dy, frame });
     tests.extend(at(0, 0));
     let near = [(2, 0), (-2, 0), (0, 2), (0, -2)];
-    for (dx, dy) in near {
-        tests.extend(at(dx, dy));
+    for (k, (dx, dy)) in near.into_iter().enumerate() {
+        // Of many frames every second: thin objects are told by their own samples alone.
+        let every = if frames > 12 { 2 } else { 1 };
+        tests.extend(at(dx, dy).skip(k % every).step_by(every));
     }
     for lag in 1..=frames / 2 {
         // At half the period each pair would come twice.
