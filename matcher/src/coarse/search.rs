@@ -16,8 +16,12 @@ pub(crate) const SEED_ROWS: usize = 16;
 const SEED_COST: u32 = 14;
 /// A match that differs in more bits than this is looked for over the whole range...
 pub(crate) const UNSURE_COST: u32 = 15;
-/// ...and what is found there must differ in no more than this.
+/// ...and what is found there must differ in no more than this; with few frames, whose tests reach beyond
+/// a thin object, in no more than that.
 const FOUND_COST: u32 = 11;
+const FOUND_COST_FEW: u32 = 13;
+/// Fewest frames that are not few.
+const FRAMES_MANY: usize = 6;
 /// Samples over time and the four neighbours span less where no dot is: 3 grey levels.
 const DARK: i16 = 3 * crate::SAMPLES_PER_DN8;
 
@@ -350,7 +354,8 @@ fn search_pixel(
     best.resize(padded, 0);
     best_candidates(scene.level, left, row, origin, &[0], best);
     let lowest = best[..count].iter().copied().min()?;
-    if lowest >> 16 > FOUND_COST {
+    let most = if scene.images.len() < FRAMES_MANY { FOUND_COST_FEW } else { FOUND_COST };
+    if lowest >> 16 > most {
         return None;
     }
     let at = best[..count].iter().position(|&b| b == lowest)?;
