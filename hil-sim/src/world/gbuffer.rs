@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::camera::CameraModel;
 use super::geometry::{Ray, Rigid};
+use super::raster::{Footprints, Seen};
 use super::scene::PosedScene;
 
 /// Cells per pixel in each direction.
@@ -22,6 +23,8 @@ pub(crate) enum Refinement {
     /// 2: enough for a view that is blurred by motion.
     Coarse = 2,
 }
+/// Rows that are looked at together.
+const BAND: usize = 16;
 /// Nothing is looked for beyond this distance.
 const FARTHEST_M: f64 = 50.0;
 
@@ -47,6 +50,11 @@ impl View<'_> {
         (cell - self.margin as f64 + 0.5) / CELLS_PER_PIXEL as f64 - 0.5
     }
 
+    /// The inverse of [`Self::pixel`].
+    pub fn cell(&self, pixel: f64) -> f64 {
+        (pixel + 0.5) * CELLS_PER_PIXEL as f64 - 0.5 + self.margin as f64
+    }
+
     /// Normalised coordinates (x/z, y/z) of the ray through each cell's centre. In single precision:
     /// that moves a ray by less than 0.0001 px.
     pub fn directions(&self) -> Vec<[f32; 2]> {
@@ -63,7 +71,7 @@ impl View<'_> {
         directions
     }
 
-    fn ray(&self, normalised: [f64; 2]) -> Ray {
+    pub fn ray(&self, normalised: [f64; 2]) -> Ray {
         let direction = Vector3::new(normalised[0], normalised[1], 1.0).normalize();
         Ray {
             origin: self.left_from_camera.translation,
@@ -157,14 +165,30 @@ impl GBuffer {
         let side = refinement as usize;
         let fine_per_cell = side * side;
         let (columns, rows) = (view.columns(), view.rows());
+        let footprints: Vec<Option<Footprints>> = scene
+            .parts()
+            .map(|(shape, pose)| Footprints::new(shape.mesh()?, view, pose, BAND))
+            .collect();
+        let ray = |direction: [f32; 2]| view.ray(direction.map(f64::from));
         let mut cells = vec![Sample::NOTHING; columns * rows];
-        cells.par_chunks_mut(columns).zip(directions.par_chunks(columns)).for_each(
-            |(line, directions)| {
-                for (cell, direction) in line.iter_mut().zip(directions) {
-                    *cell = look(scene, &view.ray(direction.map(f64::from)));
+        cells
+            .par_chunks_mut(columns * BAND)
+            .zip(directions.par_chunks(columns * BAND))
+            .enumerate()
+            .for_each(|(band, (cells, directions))| {
+                let seen: Vec<Option<Vec<Seen>>> = scene
+                    .parts()
+                    .zip(&footprints)
+                    .map(|((shape, pose), footprints)| {
+                        let mesh = shape.mesh()?;
+                        Some(footprints.as_ref()?.band(mesh, pose, band, columns, directions, ray))
+                    })
+                    .collect();
+                for (k, (cell, direction)) in cells.iter_mut().zip(directions).enumerate() {
+                    let known = |object: usize| seen[object].as_ref().map(|seen| seen[k]);
+                    *cell = look(scene, &ray(*direction), known);
                 }
-            },
-        );
+            });
         // Which cells do not continue to the right (1) or down (2): both sides are edges.
         let breaks: Vec<u8> = (0..rows)
             .into_par_iter()
@@ -190,26 +214,63 @@ impl GBuffer {
         for &index in &refined {
             cells[index as usize].is_edge = true;
         }
-        let mut fine = vec![Sample::NOTHING; refined.len() * fine_per_cell];
-        fine.par_chunks_mut(fine_per_cell).zip(&refined).for_each(|(samples, &index)| {
-            let (row, column) = (index as usize / columns, index as usize % columns);
-            let offset = |k: usize| (k as f64 + 0.5) / side as f64 - 0.5;
-            let centre = [view.pixel(column as f64), view.pixel(row as f64)];
-            let near = view.camera.unproject(centre);
-            for (k, sample) in samples.iter_mut().enumerate() {
-                let pixel = [
-                    view.pixel(column as f64 + offset(k % side)),
-                    view.pixel(row as f64 + offset(k / side)),
-                ];
-                *sample = look(scene, &view.ray(view.camera.unproject_from(pixel, near)));
-            }
-        });
+        let fine = (0..rows.div_ceil(BAND))
+            .into_par_iter()
+            .flat_map_iter(|band| fine_of_band(view, scene, &footprints, &refined, side, band))
+            .collect();
         Self { columns, cells, refined, fine, fine_per_cell }
     }
 }
 
-fn look(scene: &PosedScene<'_>, ray: &Ray) -> Sample {
-    let Some((object, hit)) = scene.nearest(ray, FARTHEST_M) else { return Sample::NOTHING };
+/// The samples of the refined cells in one band of rows, `side` along each side of a cell.
+fn fine_of_band(
+    view: &View<'_>,
+    scene: &PosedScene<'_>,
+    footprints: &[Option<Footprints>],
+    refined: &[u32],
+    side: usize,
+    band: usize,
+) -> Vec<Sample> {
+    let columns = view.columns();
+    let first_cell = band * BAND * columns;
+    let end_cell = (first_cell + BAND * columns).min(columns * view.rows());
+    let at = |cell: usize| refined.partition_point(|&index| (index as usize) < cell);
+    let refined = &refined[at(first_cell)..at(end_cell)];
+    if refined.is_empty() {
+        return Vec::new();
+    }
+    let offset = |k: usize| (k as f64 + 0.5) / side as f64 - 0.5;
+    let mut rays = Vec::with_capacity(refined.len() * side * side);
+    let mut slot_of = vec![u32::MAX; end_cell - first_cell];
+    for (slot, &index) in refined.iter().enumerate() {
+        slot_of[index as usize - first_cell] = slot as u32;
+        let (row, column) = (index as usize / columns, index as usize % columns);
+        let near = view.camera.unproject([view.pixel(column as f64), view.pixel(row as f64)]);
+        rays.extend((0..side * side).map(|k| {
+            let pixel = [
+                view.pixel(column as f64 + offset(k % side)),
+                view.pixel(row as f64 + offset(k / side)),
+            ];
+            view.ray(view.camera.unproject_from(pixel, near))
+        }));
+    }
+    let seen: Vec<Option<Vec<Seen>>> = scene
+        .parts()
+        .zip(footprints)
+        .map(|((shape, pose), footprints)| {
+            let rays: Vec<Ray> = rays.iter().map(|ray| pose.inverse_ray(ray)).collect();
+            let (mesh, footprints) = (shape.mesh()?, footprints.as_ref()?);
+            Some(footprints.samples(mesh, band, columns, &slot_of, &rays, side * side))
+        })
+        .collect();
+    let known = |k: usize, object: usize| seen[object].as_ref().map(|seen| seen[k]);
+    rays.iter().enumerate().map(|(k, ray)| look(scene, ray, |object| known(k, object))).collect()
+}
+
+fn look(scene: &PosedScene<'_>, ray: &Ray, known: impl Fn(usize) -> Option<Seen>) -> Sample {
+    let Some((object, hit)) = scene.nearest_with(ray, FARTHEST_M, known) else {
+        return Sample::NOTHING;
+    };
     let point = ray.at(hit.distance_m);
     let albedo = scene.albedo(object, &point).clamp(0.0, 1.0);
     Sample {

@@ -44,6 +44,13 @@ impl Rigid {
     pub fn inverse_vector(&self, v: &Vector3<f64>) -> Vector3<f64> {
         self.rotation.tr_mul(v)
     }
+
+    pub fn inverse_ray(&self, ray: &Ray) -> Ray {
+        Ray {
+            origin: self.inverse_point(&ray.origin),
+            direction: self.inverse_vector(&ray.direction),
+        }
+    }
 }
 
 impl From<&Isometry3<f64>> for Rigid {

@@ -8,6 +8,7 @@ use super::geometry::Ray;
 use super::material::reflectance;
 use super::pattern::{BLOCK, DirectionBlock};
 use super::projector::Light;
+use super::raster::ShadowGrid;
 use super::scene::PosedScene;
 
 /// Side of the square of cells that is lit together; a block of the pattern sum.
@@ -17,14 +18,17 @@ const LIFT_M: f64 = 2e-5;
 /// Samples of one surface nearer than this share a shadow ray at edges.
 const SHARED_SHADOW_M: f64 = 1.5e-3;
 
-/// Electrons per second of each cell, per pixel area and without vignetting.
+/// Electrons per second of each cell, per pixel area and without vignetting. `shadows` are the scene's
+/// for this light.
 pub(crate) fn illuminate(
     light: &Light,
     gbuffer: &GBuffer,
     scene: &PosedScene<'_>,
+    shadows: &[Option<ShadowGrid>],
     camera_centre: &Vector3<f64>,
 ) -> Vec<f32> {
-    let shader = Shader { light, scene, camera_centre, light_centre: light.origin() };
+    let light_centre = light.origin();
+    let shader = Shader { light, scene, camera_centre, light_centre, shadows };
     let columns = gbuffer.columns;
     let mut rates = vec![0.0_f32; gbuffer.cells.len()];
     rates.par_chunks_mut(columns * TILE).enumerate().for_each(|(stripe, out)| {
@@ -119,6 +123,7 @@ struct Shader<'a> {
     scene: &'a PosedScene<'a>,
     camera_centre: &'a Vector3<f64>,
     light_centre: Vector3<f64>,
+    shadows: &'a [Option<ShadowGrid>],
 }
 
 impl Shader<'_> {
@@ -136,7 +141,7 @@ impl Shader<'_> {
         let to_light = self.light_centre - origin;
         let distance = to_light.norm();
         let ray = Ray { origin, direction: to_light / distance };
-        !self.scene.is_occluded(&ray, distance)
+        !self.scene.is_shadowed(self.shadows, &ray, distance)
     }
 
     /// Shadows of a tile of cells: one ray a pixel, and one a cell where pixels disagree.

@@ -4,7 +4,8 @@
 //! exposure during which lights were on; [`World::truth`] says what is really there.
 //!
 //! How an image is made, step by step:
-//! - `gbuffer`: rays from the camera find the surface behind every half pixel;
+//! - `gbuffer`: rays from the camera find the surface behind every half pixel (`raster`: those of
+//!   meshes without a search for each);
 //! - `illuminate`: each light's dots or beam fall on it, unless something is in the way;
 //! - `psf`: lens and pixel blur the cells into pixels;
 //! - `expose`: each light counts as long as it was on during the exposure, then the sensor adds
@@ -31,6 +32,7 @@ mod part;
 mod pattern;
 mod projector;
 mod psf;
+mod raster;
 mod scene;
 mod shapes;
 mod spec;
@@ -78,11 +80,11 @@ impl World {
     pub fn new(scene: &SceneSpec, model: SensorModel) -> Result<Self, WorldError> {
         model.check()?;
         let scene = build::build(scene, &model.left_from_rig())?;
-        let lights = Lights {
-            projectors: model.projectors.iter().map(Light::speckle).collect(),
-            floodlight: Light::flood(&model.floodlight),
-            ambient_e_per_s: model.ambient_e_per_s,
-        };
+        let lights = Lights::new(
+            model.projectors.iter().map(Light::speckle).collect(),
+            Light::flood(&model.floodlight),
+            model.ambient_e_per_s,
+        );
         let left = CameraUnit::new(&model.left, &Isometry3::identity(), key(model.seed, 0));
         let left_from_right = model.right_from_left.inverse();
         let right = CameraUnit::new(&model.right, &left_from_right, key(model.seed, 1));

@@ -6,7 +6,9 @@ use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
 use super::geometry::{Hit, Ray, Rigid, transform_point};
 use super::material::Material;
+use super::raster::{Seen, ShadowGrid};
 use super::shapes::Shape;
+use super::trimesh::TriangleMesh;
 
 /// How an object moves. Times are virtual time.
 #[derive(Debug, Clone, PartialEq)]
@@ -80,6 +82,17 @@ pub(crate) struct Object {
     pub reach_m: f64,
 }
 
+impl Object {
+    /// The fastest point's speed, about.
+    fn speed_m_per_s(&self) -> f64 {
+        let edge = self.left_from_object.translation.vector + Vector3::new(self.reach_m, 0.0, 0.0);
+        self.motion.speed_m_per_s(&edge)
+    }
+}
+
+/// Points of a mesh by which its motion in an image is judged.
+const MOTION_POINTS: usize = 2000;
+
 /// All objects.
 pub(crate) struct Scene {
     pub objects: Vec<Object>,
@@ -92,14 +105,37 @@ impl Scene {
 
     /// The fastest point's speed, about.
     pub fn speed_m_per_s(&self) -> f64 {
-        self.objects
-            .iter()
-            .map(|o| {
-                let edge =
-                    o.left_from_object.translation.vector + Vector3::new(o.reach_m, 0.0, 0.0);
-                o.motion.speed_m_per_s(&edge)
-            })
-            .fold(0.0, f64::max)
+        self.objects.iter().map(Object::speed_m_per_s).fold(0.0, f64::max)
+    }
+
+    /// How far the fastest point moves between two times in a camera's image, about, in pixels.
+    /// `project` takes points of the left camera's frame to pixels, `focal_px` is the camera's.
+    pub fn image_motion_px(
+        &self,
+        [from_ns, to_ns]: [u64; 2],
+        project: impl Fn(&Vector3<f64>) -> Option<[f64; 2]>,
+        focal_px: f64,
+    ) -> f64 {
+        let seconds = to_ns.saturating_sub(from_ns) as f64 * 1e-9;
+        let of_object = |(index, object): (usize, &Object)| {
+            if object.speed_m_per_s() == 0.0 {
+                return 0.0;
+            }
+            let poses = [from_ns, to_ns].map(|t| Rigid::from(&self.left_from_object(index, t)));
+            let vertices = object.shape.mesh().map_or(&[][..], TriangleMesh::vertices);
+            let moved = vertices
+                .iter()
+                .step_by((vertices.len() / MOTION_POINTS).max(1))
+                .filter_map(|vertex| {
+                    let [from, to] = poses.map(|p| project(&(p.rotation * vertex + p.translation)));
+                    let ([x0, y0], [x1, y1]) = (from?, to?);
+                    Some((x1 - x0).hypot(y1 - y0))
+                })
+                .reduce(f64::max);
+            // Without points to follow: a point at 1 m that moves across the line of sight.
+            moved.unwrap_or(object.speed_m_per_s() * seconds * focal_px)
+        };
+        self.objects.iter().enumerate().map(of_object).fold(0.0, f64::max)
     }
 
     /// Pose of an object at a time.
@@ -127,10 +163,27 @@ impl PosedScene<'_> {
     /// The nearest surface on a ray of the left camera's frame; the normal is turned to the ray's
     /// origin.
     pub fn nearest(&self, ray: &Ray, max_m: f64) -> Option<(usize, Hit)> {
+        self.nearest_with(ray, max_m, |_| None)
+    }
+
+    /// [`Self::nearest`] where it is known already what the ray meets of some objects' meshes; `None`
+    /// for those that have to be asked.
+    pub fn nearest_with(
+        &self,
+        ray: &Ray,
+        max_m: f64,
+        known: impl Fn(usize) -> Option<Seen>,
+    ) -> Option<(usize, Hit)> {
         let mut best: Option<(usize, Hit)> = None;
         let mut max_m = max_m;
         for (i, (object, pose)) in self.scene.objects.iter().zip(&self.poses).enumerate() {
-            if let Some(hit) = object.shape.intersect(&local(pose, ray), max_m) {
+            let hit = match (known(i), object.shape.mesh()) {
+                (Some(seen), Some(mesh)) => seen
+                    .filter(|(_, crossing)| crossing.distance_m < max_m)
+                    .map(|(facet, crossing)| mesh.hit(facet as usize, &crossing)),
+                _ => object.shape.intersect(&pose.inverse_ray(ray), max_m),
+            };
+            if let Some(hit) = hit {
                 max_m = hit.distance_m;
                 best = Some((i, Hit { normal: pose.vector(&hit.normal), ..hit }));
             }
@@ -149,7 +202,30 @@ impl PosedScene<'_> {
             .objects
             .iter()
             .zip(&self.poses)
-            .any(|(object, pose)| object.shape.occludes(&local(pose, ray), max_m))
+            .any(|(object, pose)| object.shape.occludes(&pose.inverse_ray(ray), max_m))
+    }
+
+    /// What each object's mesh may put in the shadow of a light, for [`Self::is_shadowed`].
+    pub fn shadows(&self, light_left_m: &Vector3<f64>) -> Vec<Option<ShadowGrid>> {
+        self.parts()
+            .map(|(shape, pose)| ShadowGrid::new(shape.mesh()?, &pose.inverse_point(light_left_m)))
+            .collect()
+    }
+
+    /// [`Self::is_occluded`] for a ray to the light that `shadows` were made for.
+    pub fn is_shadowed(&self, shadows: &[Option<ShadowGrid>], ray: &Ray, distance_m: f64) -> bool {
+        self.parts().zip(shadows).any(|((shape, pose), grid)| {
+            let ray = pose.inverse_ray(ray);
+            match (grid, shape.mesh()) {
+                (Some(grid), Some(mesh)) => grid.is_shadowed(mesh, &ray, distance_m),
+                _ => shape.occludes(&ray, distance_m),
+            }
+        })
+    }
+
+    /// Each object's shape and pose.
+    pub fn parts(&self) -> impl Iterator<Item = (&dyn Shape, &Rigid)> {
+        self.scene.objects.iter().map(|o| &*o.shape).zip(&self.poses)
     }
 
     /// Diffuse albedo of an object at a point of the left camera's frame.
@@ -157,10 +233,6 @@ impl PosedScene<'_> {
         let local = self.poses[object].inverse_point(point_left_m);
         self.scene.objects[object].material.albedo(&local)
     }
-}
-
-fn local(pose: &Rigid, ray: &Ray) -> Ray {
-    Ray { origin: pose.inverse_point(&ray.origin), direction: pose.inverse_vector(&ray.direction) }
 }
 
 /// A still object.

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::geometry::{Hit, Ray};
-use super::trimesh::Triangles;
+use super::trimesh::{TriangleMesh, Triangles};
 
 /// A surface that rays can meet.
 pub(crate) trait Shape: Send + Sync {
@@ -20,9 +20,14 @@ pub(crate) trait Shape: Send + Sync {
         Vec::new()
     }
 
+    /// The mesh, if the surface is one.
+    fn mesh(&self) -> Option<&TriangleMesh> {
+        None
+    }
+
     /// The surface's triangles, if it is made of them.
     fn triangles(&self) -> Option<&Triangles> {
-        None
+        self.mesh().map(TriangleMesh::triangles)
     }
 }
 

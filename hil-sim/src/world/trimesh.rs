@@ -121,6 +121,48 @@ impl TriangleMesh {
         Self { triangles, facets, bvh, bounds }
     }
 
+    /// Vertices and triples of indices into them.
+    pub fn triangles(&self) -> &Triangles {
+        &self.triangles
+    }
+
+    /// All corners.
+    pub fn vertices(&self) -> &[Vector3<f64>] {
+        &self.triangles.vertices
+    }
+
+    /// How many facets there are.
+    pub fn facet_count(&self) -> usize {
+        self.facets.len()
+    }
+
+    /// Each facet's corners as indices into the vertices.
+    pub fn corners(&self) -> impl Iterator<Item = [u32; 3]> {
+        self.bvh.primitive_indices.iter().map(|&i| self.triangles.indices[i as usize])
+    }
+
+    /// A box around all of it.
+    pub fn bounds(&self) -> &Aabb {
+        &self.bounds
+    }
+
+    /// Where a ray meets a facet before `max_m`.
+    pub fn cross(&self, facet: usize, ray: &Ray, max_m: f64) -> Option<Crossing> {
+        self.facets[facet].cross(ray, max_m)
+    }
+
+    /// The surface where a ray crosses a facet.
+    pub fn hit(&self, facet: usize, crossing: &Crossing) -> Hit {
+        let facet = &self.facets[facet];
+        let facing = facet.edges[0].cross(&facet.edges[1]);
+        let mut normal = facet.shading_normal(crossing.weights);
+        // The interpolated normal must be on the side that is seen, as the facet's is.
+        if normal.dot(&facing) < 0.0 {
+            normal = -normal;
+        }
+        Hit { distance_m: crossing.distance_m, normal }
+    }
+
     fn nearest(&self, ray: &Ray, max_m: f64) -> Option<(usize, Crossing)> {
         // Most rays of a camera miss; this finds out sooner than the hierarchy.
         if !self.bounds.is_crossed_by(ray, max_m) {
@@ -176,8 +218,12 @@ impl Facet {
     }
 }
 
-struct Crossing {
-    distance_m: f64,
+/// Where a ray crosses a facet.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Crossing {
+    /// Distance along the ray.
+    pub distance_m: f64,
+    /// Weights of the second and third corner.
     weights: [f64; 2],
 }
 
@@ -194,14 +240,7 @@ fn upper32(v: f64) -> f32 {
 impl Shape for Arc<TriangleMesh> {
     fn intersect(&self, ray: &Ray, max_m: f64) -> Option<Hit> {
         let (index, crossing) = self.nearest(ray, max_m)?;
-        let facet = &self.facets[index];
-        let facing = facet.edges[0].cross(&facet.edges[1]);
-        let mut normal = facet.shading_normal(crossing.weights);
-        // The interpolated normal must be on the side that is seen, as the facet's is.
-        if normal.dot(&facing) < 0.0 {
-            normal = -normal;
-        }
-        Some(Hit { distance_m: crossing.distance_m, normal })
+        Some(self.hit(index, &crossing))
     }
 
     fn occludes(&self, ray: &Ray, max_m: f64) -> bool {
@@ -214,8 +253,8 @@ impl Shape for Arc<TriangleMesh> {
             })
     }
 
-    fn triangles(&self) -> Option<&Triangles> {
-        Some(&self.triangles)
+    fn mesh(&self) -> Option<&TriangleMesh> {
+        Some(self)
     }
 }
 
