@@ -37,12 +37,13 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
          paper's motion. The model's error is its points' distance from the surface that was rendered, \
          at the time that the first window's depth refers to, with no alignment to it.",
     );
-    turning(studio, &mut section)?;
+    whole(studio, &mut section, true)?;
+    whole(studio, &mut section, false)?;
     plane(studio, &mut section)?;
     Ok(section)
 }
 
-/// Fuses a whole turn; `options` and `first` say how view k is recorded.
+/// Fuses a whole turn of the statue, turning or standing.
 fn whole(
     studio: &mut Studio<'_>,
     section: &mut Section,
@@ -135,11 +136,6 @@ fn whole(
     Ok(())
 }
 
-fn turning(studio: &mut Studio<'_>, section: &mut Section) -> Result<(), ExperimentError> {
-    whole(studio, section, true)?;
-    whole(studio, section, false)
-}
-
 /// The surface of a take's object at a time.
 pub(super) fn surface_of(
     take: &Take,
@@ -189,12 +185,13 @@ fn plane(studio: &mut Studio<'_>, section: &mut Section) -> Result<(), Experimen
     }
     for k in 0..WINDOWS[1] {
         let options = [("distance_m", "1.08")];
-        let take = studio.take("plane", &options, k * FRAMES)?;
+        let waited_s = 4.0 * k as f64;
+        let take = studio.take("plane", &options, (waited_s * RATE_HZ).round() as usize)?;
         let truth = studio.truth(&take);
         let frame = studio.matched(&take, FRAMES, |_| ())?;
         let (rms_mm, _) = central_plane_mm(&frame, &truth)?;
         standing.push(rms_mm);
-        curve.push((moves_s + 1.0 + (k * FRAMES) as f64, rms_mm));
+        curve.push((moves_s + 1.0 + waited_s, rms_mm));
     }
     studio.depths(DepthRange::default());
     let spread = |values: &[f64]| {

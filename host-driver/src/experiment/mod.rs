@@ -30,6 +30,7 @@ use stspp_matcher::{Error as MatchError, Method, ShapeFunction};
 pub use chart::{Chart, Series};
 pub use studio::Studio;
 
+use crate::cpu_time::process_cpu_ms;
 use crate::fuse::FuseError;
 use crate::measure::FitError;
 use crate::recording::RecordingError;
@@ -92,6 +93,7 @@ impl Figure {
     /// [`ExperimentError`].
     pub fn run(self, studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
         let begun = std::time::Instant::now();
+        let cpu_ms = process_cpu_ms();
         studio.use_way(self.way());
         let mut section = match self {
             Self::Fig2 => fig2::run(studio),
@@ -109,6 +111,7 @@ impl Figure {
             _ => " Matched by IC-GN, point by point, as the paper does (`--method icgn`).",
         };
         section.seconds = begun.elapsed().as_secs_f64();
+        section.cpu_seconds = process_cpu_ms().zip(cpu_ms).map(|(now, then)| (now - then) * 1e-3);
         Ok(section)
     }
 }
@@ -238,6 +241,8 @@ pub struct Section {
     pub pictures: Vec<Picture>,
     /// Time that it took, seconds.
     pub seconds: f64,
+    /// CPU time of all threads, seconds, where known: what a busy machine does not falsify.
+    pub cpu_seconds: Option<f64>,
 }
 
 impl Section {
@@ -251,6 +256,7 @@ impl Section {
             charts: Vec::new(),
             pictures: Vec::new(),
             seconds: 0.0,
+            cpu_seconds: None,
         }
     }
 }

@@ -1,12 +1,12 @@
 //! A view: points, how the sensor saw them, and how much they count.
 
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::{Isometry3, Point3, Vector3};
 use rayon::prelude::*;
 
 use super::noise;
 use crate::PointCloud;
 use crate::register::normals::{Normals, estimate_normals};
+use crate::register::tree::PointTree;
 
 /// A cloud in its own sensor frame (sensor at the origin), with what fusion needs of each point.
 #[derive(Debug, Clone)]
@@ -42,14 +42,11 @@ impl View {
         }
         let points: Vec<[f64; 3]> =
             chosen.iter().map(|&k| cloud.points_left_m[k].cast::<f64>().coords.into()).collect();
-        let tree: ImmutableKdTree<f64, 3> = ImmutableKdTree::new_from_slice(&points).ok()?;
+        let tree = PointTree::new(&points)?;
         let tenth = std::num::NonZero::new(10)?;
         let reach: Vec<f32> = points
             .par_iter()
-            .map(|p| {
-                let near = tree.query(p).nearest_n::<SquaredEuclidean<f64>>(tenth).execute();
-                near.iter().map(|n| n.distance).fold(0.0, f64::max).sqrt() as f32
-            })
+            .map(|p| tree.nearest_n(p, tenth).map(|(_, far)| far).fold(0.0, f64::max) as f32)
             .collect();
         let mut sorted = reach.clone();
         let middle = sorted.len() / 2;

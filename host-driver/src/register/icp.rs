@@ -82,6 +82,9 @@ struct Pair {
 }
 
 const LEAST_PAIRS: usize = 12;
+/// Each level of density has about so many times the points of the one before. The pose of a level is
+/// off by the noise over the root of its points, so that few steps remain on the next.
+const LEVEL: usize = 8;
 
 /// Registers the finite points of `source_m` on `target`, starting from `target_from_source`.
 ///
@@ -104,20 +107,15 @@ pub fn register(
     }
     let mut pose = target_from_source;
     let mut gate_m = params.max_distance_m;
-    let stride = source.len().div_ceil(params.coarse_points.max(LEAST_PAIRS));
-    if stride > 1 {
+    let mut points = params.coarse_points.max(LEAST_PAIRS);
+    while points < source.len() {
+        let stride = source.len().div_ceil(points);
         let coarse: Vec<_> = source.iter().copied().step_by(stride).collect();
         // Coarse steps only bring the pose near; what they cannot settle the dense ones will.
         let settled = (params.settled_rad * 100.0, params.settled_m * 100.0);
-        iterate(
-            &coarse,
-            target,
-            &mut pose,
-            &mut gate_m,
-            params,
-            4 * params.iterations_max,
-            settled,
-        )?;
+        let most = 4 * params.iterations_max;
+        iterate(&coarse, target, &mut pose, &mut gate_m, params, most, settled)?;
+        points = points.saturating_mul(LEVEL);
     }
     let settled = (params.settled_rad, params.settled_m);
     iterate(&source, target, &mut pose, &mut gate_m, params, params.iterations_max, settled)
@@ -132,13 +130,14 @@ fn iterate(
     iterations_max: usize,
     (settled_rad, settled_m): (f64, f64),
 ) -> Result<IcpResult, RegisterError> {
-    let mut settled = false;
-    for _ in 0..iterations_max {
+    let mut iteration = 0;
+    loop {
+        iteration += 1;
         let pairs = pair(source, target, pose, *gate_m, params.keep)?;
-        let (normal, right, centroid, squares) = normal_equations(&pairs);
+        let (normal, right, centroid_m, squares) = normal_equations(&pairs);
         check_rank(&normal, pairs.len())?;
         let twist = -normal.cholesky().ok_or(RegisterError::Degenerate { free: 1 })?.solve(&right);
-        *pose = about(&centroid, &motion_of_twist(&twist)) * *pose;
+        *pose = about(&centroid_m, &motion_of_twist(&twist)) * *pose;
         let moved_m = twist.fixed_rows::<3>(3).norm();
         let turned_rad = twist.fixed_rows::<3>(0).norm();
         // Six times the median holds nearly all true pairs, whatever noise or spacing it comes from.
@@ -147,22 +146,21 @@ fn iterate(
         // A step of a tenth of the pose's own standard deviation says nothing any more: with noisy
         // clouds, pairs change for ever without leading anywhere.
         let variance = squares / pairs.len() as f64;
-        let insignificant = twist.dot(&(normal * twist)) < 0.01 * variance;
-        settled = (turned_rad < settled_rad && moved_m < settled_m) || insignificant;
-        if settled {
-            break;
+        let gained = twist.dot(&(normal * twist));
+        let settled = (turned_rad < settled_rad && moved_m < settled_m) || gained < 0.01 * variance;
+        if settled || iteration >= iterations_max {
+            // The last step was small: its pairs still are the closest, and their squares are what a
+            // least-squares step leaves.
+            return Ok(IcpResult {
+                target_from_source: *pose,
+                rms_m: ((squares - gained).max(0.0) / pairs.len() as f64).sqrt(),
+                overlap: pairs.len() as f64 / (params.keep * source.len() as f64),
+                information: normal,
+                centroid_m,
+                settled,
+            });
         }
     }
-    let pairs = pair(source, target, pose, *gate_m, params.keep)?;
-    let (information, _, centroid_m, squares) = normal_equations(&pairs);
-    Ok(IcpResult {
-        target_from_source: *pose,
-        rms_m: (squares / pairs.len() as f64).sqrt(),
-        overlap: pairs.len() as f64 / (params.keep * source.len() as f64),
-        information,
-        centroid_m,
-        settled,
-    })
 }
 
 /// The `keep` closest pairs within `gate_m`, in the source's order.

@@ -15,6 +15,7 @@ pub mod normals;
 pub mod pose_graph;
 pub mod surface;
 pub mod thin;
+pub(crate) mod tree;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3, Vector6};
 

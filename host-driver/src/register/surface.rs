@@ -2,7 +2,7 @@
 
 use super::RegisterError;
 use super::normals::{Normals, estimate_normals};
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use super::tree::PointTree;
 use nalgebra::{Point3, Vector3};
 
 /// The closest point of a surface.
@@ -33,7 +33,7 @@ pub trait Surface: Sync {
 pub struct CloudSurface {
     points_m: Vec<[f64; 3]>,
     normals: Vec<Vector3<f64>>,
-    tree: ImmutableKdTree<f64, 3>,
+    tree: PointTree,
 }
 
 impl CloudSurface {
@@ -53,7 +53,7 @@ impl CloudSurface {
         if points_m.len() < needed {
             return Err(few);
         }
-        let tree = ImmutableKdTree::new_from_slice(&points_m).map_err(|_| few)?;
+        let tree = PointTree::new(&points_m).ok_or(few)?;
         let normals = estimate_normals(&points_m, &tree, &Normals::default());
         Ok(Self { points_m, normals, tree })
     }
@@ -76,15 +76,13 @@ impl Surface for CloudSurface {
 
     fn closest(&self, query_m: &Point3<f64>, max_distance_m: f64) -> Option<Closest> {
         let query = [query_m.x, query_m.y, query_m.z];
-        let nearest = self.tree.query(&query).nearest_one::<SquaredEuclidean<f64>>().execute();
-        if nearest.distance > max_distance_m * max_distance_m {
-            return None;
-        }
-        let index = nearest.item as usize;
-        Some(Closest {
-            point_m: Point3::from(self.points_m[index]),
+        let index = self.tree.nearest(&query);
+        let point_m = Point3::from(self.points_m[index]);
+        let distance_m = (query_m - point_m).norm();
+        (distance_m <= max_distance_m).then(|| Closest {
+            point_m,
             normal: self.normals[index],
-            distance_m: nearest.distance.sqrt(),
+            distance_m,
         })
     }
 }

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
 use serde_json::json;
+use stspp::cpu_time::process_cpu_ms;
 use stspp::experiment::{ExperimentError, Figure, Section, Studio, report};
 use stspp::export::folder::OutputFolder;
 use stspp::report::peak_memory_bytes;
@@ -115,8 +116,10 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let memory = peak_memory_bytes().map_or(String::new(), |bytes| {
         format!(", peak memory {:.1} GiB", bytes as f64 / f64::from(1 << 30))
     });
+    let cpu_seconds = process_cpu_ms().map(|ms| ms * 1e-3);
+    let cpu = cpu_seconds.map_or(String::new(), |s| format!(" ({s:.0} s of CPU)"));
     let made_by = format!(
-        "stspp {}, seed {}; {:.0} s on {} threads, {rendered} recordings rendered, {reused} \
+        "stspp {}, seed {}; {:.0} s on {} threads{cpu}, {rendered} recordings rendered, {reused} \
          reused{memory}.",
         env!("CARGO_PKG_VERSION"),
         args.seed,
@@ -124,9 +127,10 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         std::thread::available_parallelism().map_or(1, usize::from),
     );
     let json = json!({
-        "made_by": made_by, "seconds": seconds,
+        "made_by": made_by, "seconds": seconds, "cpu_seconds": cpu_seconds,
         "figures": sections.iter().map(|s| json!({
             "figure": s.figure.name(), "title": s.title, "seconds": s.seconds,
+            "cpu_seconds": s.cpu_seconds,
             "rows": s.rows.iter().map(|r| json!({
                 "quantity": r.quantity, "paper": r.paper, "ours": r.ours,
                 "better": r.is_better(), "note": r.note,
@@ -143,8 +147,13 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     progress.finish_and_clear();
     let mut text = String::new();
     for section in &sections {
-        text +=
-            &format!("\n{}: {} ({:.0} s)\n", section.figure.name(), section.title, section.seconds);
+        let cpu = section.cpu_seconds.map_or(String::new(), |s| format!(", {s:.0} s of CPU"));
+        text += &format!(
+            "\n{}: {} ({:.0} s{cpu})\n",
+            section.figure.name(),
+            section.title,
+            section.seconds
+        );
         for row in &section.rows {
             let paper = row.paper.map_or("-".into(), |v| format!("{v:.*}", row.digits));
             let word = row.is_better().map_or("", |b| if b { "better" } else { "WORSE" });
