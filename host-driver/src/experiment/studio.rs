@@ -93,8 +93,8 @@ impl<'a> Studio<'a> {
         &self.params
     }
 
-    /// Records a scene by its name and options, from frame `first` of its time on, or reads what was
-    /// recorded before.
+    /// Records [`FRAMES`] pairs of a scene by its name and options, from frame `first` of its time on, or
+    /// reads what was recorded before.
     ///
     /// # Errors
     /// For a scene that cannot be, or a folder that cannot be written.
@@ -104,6 +104,20 @@ impl<'a> Studio<'a> {
         options: &[(&str, &str)],
         first: usize,
     ) -> Result<Take, ExperimentError> {
+        self.take_frames(name, options, first, FRAMES)
+    }
+
+    /// As [`Studio::take`], of `frames` pairs.
+    ///
+    /// # Errors
+    /// As [`Studio::take`].
+    pub fn take_frames(
+        &mut self,
+        name: &str,
+        options: &[(&str, &str)],
+        first: usize,
+        frames: usize,
+    ) -> Result<Take, ExperimentError> {
         let spec = SceneSpec::parse(name, options)?;
         let world = World::new(&spec, SensorModel::with_seed(self.seed))?;
         let options: Vec<String> =
@@ -111,7 +125,7 @@ impl<'a> Studio<'a> {
         let label = format!("{name} {}", options.join(" "));
         // What the images depend on; a recording of anything else is made anew.
         let slate = format!(
-            "{spec:?} seed {} first {first} frames {FRAMES} stspp {}\n",
+            "{spec:?} seed {} first {first} frames {frames} stspp {}\n",
             self.seed,
             env!("CARGO_PKG_VERSION")
         );
@@ -121,7 +135,7 @@ impl<'a> Studio<'a> {
             self.reused += 1;
             self.say(format!("{label}: reading the recording"));
             let recording = Recording::open(&folder)?;
-            let pairs = recording.read_window(0..FRAMES.min(recording.len()))?;
+            let pairs = recording.read_window(0..frames.min(recording.len()))?;
             Capture {
                 world,
                 calibration: recording.calibration.clone(),
@@ -131,8 +145,8 @@ impl<'a> Studio<'a> {
         } else {
             self.rendered += 1;
             let progress = &mut *self.progress;
-            let capture = Capture::record_from(world, first, FRAMES, &mut |k| {
-                progress(format!("{label}: exposing pair {} of {FRAMES}", k + 1));
+            let capture = Capture::record_from(world, first, frames, &mut |k| {
+                progress(format!("{label}: exposing pair {} of {frames}", k + 1));
             });
             let Capture { calibration, pairs, labels, .. } = &capture;
             recording::write(&folder, calibration, pairs, labels, true)?;

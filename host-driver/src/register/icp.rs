@@ -85,6 +85,8 @@ const LEAST_PAIRS: usize = 12;
 /// Each level of density has about so many times the points of the one before. The pose of a level is
 /// off by the noise over the root of its points, so that few steps remain on the next.
 const LEVEL: usize = 8;
+/// A move of this share of the points' distance leaves nearly all pairs as they are.
+const PAIRS_HOLD: f64 = 0.02;
 
 /// Registers the finite points of `source_m` on `target`, starting from `target_from_source`.
 ///
@@ -147,7 +149,13 @@ fn iterate(
         // clouds, pairs change for ever without leading anywhere.
         let variance = squares / pairs.len() as f64;
         let gained = twist.dot(&(normal * twist));
-        let settled = (turned_rad < settled_rad && moved_m < settled_m) || gained < 0.01 * variance;
+        // Nor does a step that is small against the distance of a cloud's points: hardly any pair would
+        // change, and for these pairs this step is the last already.
+        let reach_m = pairs.iter().step_by(64).map(|p| (p.moved_m - centroid_m).norm());
+        let farthest_m = moved_m + turned_rad * reach_m.fold(0.0, f64::max);
+        let settled = (turned_rad < settled_rad && moved_m < settled_m)
+            || gained < 0.01 * variance
+            || (target.is_sampled() && farthest_m < PAIRS_HOLD * median_m);
         if settled || iteration >= iterations_max {
             // The last step was small: its pairs still are the closest, and their squares are what a
             // least-squares step leaves.
