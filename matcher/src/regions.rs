@@ -18,7 +18,7 @@ pub const BEND_PX: f32 = 1.0;
 
 /// Whether neighbours `a` and `b` are on one surface, given what is beyond them: `before` a and `after`
 /// b. NaN is on none.
-fn joined(before: f32, a: f32, b: f32, after: f32) -> bool {
+pub(crate) fn joined(before: f32, a: f32, b: f32, after: f32) -> bool {
     let difference = b - a;
     let bend = |other: f32| (difference - other).abs() <= BEND_PX;
     difference.abs() <= STEP_PX

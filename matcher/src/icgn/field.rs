@@ -21,6 +21,12 @@ const BAND: usize = 16;
 /// Most passes of growth: what is further from any match is no gap but a hole.
 pub const PASSES_MAX: usize = 48;
 
+/// Least ratio of the widths at which the two cameras see a piece of surface. Below it a subset of nine
+/// columns has three in the other image, dots are narrower than its pixels, and errors grow faster than
+/// the sphere's limb is long: without the limit a rendered sphere of another make, N = 10, has a fit RMS
+/// of 0.0210 mm at 99.70 % completeness, with it 0.0196 mm at 99.63 %; with 0.4, 0.0183 mm at 99.55 %.
+const COMPRESSION_MIN: f32 = 0.35;
+
 /// A point of the refined map.
 #[derive(Debug, Clone, Copy)]
 pub struct Estimate {
@@ -66,7 +72,9 @@ pub struct Field {
 }
 
 impl Field {
-    /// Refines every pixel with a coarse disparity, grows, and settles depth steps. `map` becomes the
+    /// Refines every pixel with a coarse disparity, grows, and settles depth steps: once before steep
+    /// faces are looked for, which would find their place taken by what reaches beyond silhouettes, and
+    /// once more with what was found there. `map` becomes the
     /// refined disparity.
     pub fn refine(
         &mut self,
@@ -84,8 +92,20 @@ impl Field {
         self.refine_matched(&refiner, map);
         self.write_to(map);
         self.grow(&refiner, map, stack.left_mask);
+        self.judge_steps(map, stack, level);
         self.fill_steep(&refiner, map, stack, params);
         self.settle_steps(&refiner, map, stack, level);
+        self.drop_compressed();
+    }
+
+    /// Drops the points that one camera sees compressed to less than [`COMPRESSION_MIN`].
+    fn drop_compressed(&mut self) {
+        let range = COMPRESSION_MIN..=1.0 / COMPRESSION_MIN;
+        self.points.par_iter_mut().for_each(|point| {
+            if !range.contains(&(1.0 + point.shape[1])) {
+                *point = Estimate::NONE;
+            }
+        });
     }
 
     /// Looks for surfaces in the gaps that were too steep for the coarse search's square windows, and
@@ -133,17 +153,9 @@ impl Field {
         level: Level,
     ) {
         let width = self.width;
-        let mut disparity_px = self.disparity_px();
-        let mut verdicts = Image::new(width, self.height, Verdict::Kept);
-        let judge = self.judge.get_or_insert_with(|| StepJudge::new(level));
-        judge.judge(stack, &mut disparity_px, &mut verdicts);
+        let (disparity_px, verdicts) = self.judge_steps(map, stack, level);
         let moved = |i: usize| verdicts.as_slice()[i] == Verdict::Moved;
-        for (i, &verdict) in verdicts.as_slice().iter().enumerate() {
-            if verdict != Verdict::Kept {
-                self.points[i] = Estimate::NONE;
-                map.set(i % width, i / width, disparity_px.as_slice()[i]);
-            }
-        }
+        let Some(judge) = &self.judge else { return };
         let near = judge.near();
         let open: Vec<u32> = (0..self.points.len() as u32)
             .into_par_iter()
@@ -170,6 +182,27 @@ impl Field {
             self.points[at] = point;
             map.set(at % width, at / width, -point.shape[0]);
         }
+    }
+
+    /// Lets the pixels' own grey values decide at depth steps: points that show another surface or none
+    /// are no points any more, and `map` has what they show. Gives the judged map and the verdicts.
+    fn judge_steps(
+        &mut self,
+        map: &mut CoarseMap,
+        stack: &StereoStack<'_>,
+        level: Level,
+    ) -> (Image<f32>, Image<Verdict>) {
+        let mut disparity_px = self.disparity_px();
+        let mut verdicts = Image::new(self.width, self.height, Verdict::Kept);
+        let judge = self.judge.get_or_insert_with(|| StepJudge::new(level));
+        judge.judge(stack, &mut disparity_px, &mut verdicts);
+        for (i, &verdict) in verdicts.as_slice().iter().enumerate() {
+            if verdict != Verdict::Kept {
+                self.points[i] = Estimate::NONE;
+                map.set(i % self.width, i / self.width, disparity_px.as_slice()[i]);
+            }
+        }
+        (disparity_px, verdicts)
     }
 
     /// The shape at a pixel that was given to the surface of `disparity_px`: a neighbour's on that

@@ -7,7 +7,7 @@ use super::{
     solve::Cholesky,
     window::{ROWS_MAX, Window},
 };
-use crate::{Image, Level, bspline::LANES, check::STEP_PX, lanes::vectorised};
+use crate::{Image, Level, bspline::LANES, check::STEP_PX, lanes::vectorised, regions::STEEP_PX};
 
 /// Coarse disparities with margins of NaN, so that subsets at the border need no special case.
 #[derive(Debug, Default)]
@@ -202,8 +202,9 @@ impl Guesser {
     /// The fit over the pixels of the centre's surface.
     ///
     /// The surface is first what is connected to the centre by steps of at most [`STEP_PX`]: that
-    /// follows any slope but does not cross a depth step. Then it is all pixels within the tolerance
-    /// of the fit through those.
+    /// follows most slopes but does not cross a depth step. Then it is all pixels within the tolerance
+    /// of the fit through those. Where that comes to nothing, the same is tried with steps from the
+    /// square's prevailing slope: a face seen edge on falls by more from row to row.
     fn guess_part(
         &self,
         map: &CoarseMap,
@@ -221,21 +222,10 @@ impl Guesser {
                 row[lane] = from[lane] - centre;
             }
         }
-        let mut member = self.connected(&values);
-        let mut fit = [0.0; 6];
-        for _ in 0..2 {
-            fit = self.fit(&values, &member)?;
-            for (dx, dy) in square(self.radius) {
-                let (r, c) = self.index(dx, dy);
-                let error = values[r][c] - surface(&fit, dx, dy) as f32;
-                member[r][c] = error.abs() <= self.surface_px;
-            }
-        }
+        let (fit, member) = self
+            .surface_of(&values, self.connected(&values))
+            .or_else(|| self.surface_of(&values, self.connected(&level(&values, side)?)))?;
         let shape = shape(fit, centre);
-        let (cx, cy) = self.index(0, 0);
-        if !member[cx][cy] {
-            return None;
-        }
         part.select(self.radius, prepared, |dx, dy| {
             let (r, c) = self.index(dx, dy);
             member[r][c] && {
@@ -243,8 +233,33 @@ impl Guesser {
                 prepared.right_sees((y as i64 + dy as i64) as usize, warped)
             }
         });
-        // Fewer pixels than this cannot carry the parameters.
-        (part.count() >= 2 * self.parameters.max(self.radius)).then_some(shape)
+        (part.count() >= self.pixels_min()).then_some(shape)
+    }
+
+    /// The fit over `member` and then twice over what is within the tolerance of it, and those pixels;
+    /// `None` where they are too few or the centre is not among them.
+    fn surface_of(
+        &self,
+        values: &Square<f32>,
+        mut member: Square<bool>,
+    ) -> Option<([f64; 6], Square<bool>)> {
+        let mut fit = [0.0; 6];
+        for _ in 0..2 {
+            fit = self.fit(values, &member)?;
+            for (dx, dy) in square(self.radius) {
+                let (r, c) = self.index(dx, dy);
+                let error = values[r][c] - surface(&fit, dx, dy) as f32;
+                member[r][c] = error.abs() <= self.surface_px;
+            }
+        }
+        let (r, c) = self.index(0, 0);
+        let count = member.as_flattened().iter().filter(|m| **m).count();
+        (member[r][c] && count >= self.pixels_min()).then_some((fit, member))
+    }
+
+    /// Fewer pixels than this cannot carry the parameters.
+    fn pixels_min(&self) -> usize {
+        2 * self.parameters.max(self.radius)
     }
 
     fn index(&self, dx: i32, dy: i32) -> (usize, usize) {
@@ -252,7 +267,7 @@ impl Guesser {
     }
 
     /// Pixels connected to the centre.
-    fn connected(&self, values: &[[f32; LANES]; ROWS_MAX]) -> [[bool; LANES]; ROWS_MAX] {
+    fn connected(&self, values: &Square<f32>) -> Square<bool> {
         let side = 2 * self.radius + 1;
         let mut member = [[false; LANES]; ROWS_MAX];
         let mut stack = [(0u8, 0u8); LANES * ROWS_MAX];
@@ -279,11 +294,7 @@ impl Guesser {
     }
 
     /// Least squares over the members; of lower order where they are too few or lie in a line.
-    fn fit(
-        &self,
-        values: &[[f32; LANES]; ROWS_MAX],
-        member: &[[bool; LANES]; ROWS_MAX],
-    ) -> Option<[f64; 6]> {
+    fn fit(&self, values: &Square<f32>, member: &Square<bool>) -> Option<[f64; 6]> {
         let members = || {
             square(self.radius).filter(|&(dx, dy)| {
                 let (r, c) = self.index(dx, dy);
@@ -311,6 +322,41 @@ impl Guesser {
         }
         None
     }
+}
+
+/// Radius of the square that a slope is taken from.
+const SLOPE_RADIUS: usize = 2;
+
+/// What a square's pixels are or have, by row and lane.
+type Square<T> = [[T; LANES]; ROWS_MAX];
+
+/// The first `side` rows and columns less the slope at their middle: the medians of the differences
+/// between neighbours there. `None` where there are too few.
+fn level(values: &Square<f32>, side: usize) -> Option<Square<f32>> {
+    let from = (side / 2).saturating_sub(SLOPE_RADIUS);
+    let to = (side / 2 + SLOPE_RADIUS + 1).min(side);
+    let median = |step: (usize, usize)| {
+        let mut differences = [0f32; (2 * SLOPE_RADIUS + 1).pow(2)];
+        let mut count = 0;
+        for r in from..to - step.1 {
+            for c in from..to - step.0 {
+                let difference = values[r + step.1][c + step.0] - values[r][c];
+                if difference.abs() <= STEEP_PX {
+                    differences[count] = difference;
+                    count += 1;
+                }
+            }
+        }
+        let differences = &mut differences[..count];
+        (count > SLOPE_RADIUS)
+            .then(|| *differences.select_nth_unstable_by(count / 2, f32::total_cmp).1)
+    };
+    let (sx, sy) = (median((1, 0))?, median((0, 1))?);
+    let mut out = *values;
+    for (r, row) in out.iter_mut().enumerate() {
+        row.iter_mut().enumerate().for_each(|(c, v)| *v -= sx * c as f32 + sy * r as f32);
+    }
+    Some(out)
 }
 
 /// A fit over a whole square.

@@ -1,7 +1,10 @@
 //! The surfaces that a pixel could show.
 
 use super::{ALONG_PX, JUMP_PX, STEEP};
-use crate::Image;
+use crate::{
+    Image,
+    regions::{BEND_PX, STEEP_PX},
+};
 
 /// How far another surface is looked for: beyond the width of fattening, and one more.
 const REACH: usize = 4;
@@ -76,10 +79,16 @@ impl Candidates {
 pub(crate) fn plane(map: &Image<f32>, x: usize, y: usize, value: f32) -> Candidate {
     let slope = |sx: isize, sy: isize| {
         let side = |sign: isize| {
-            let px = x.checked_add_signed(2 * sign * sx)?;
-            let py = y.checked_add_signed(2 * sign * sy)?;
-            let difference = (map.get(px, py)? - value) * (0.5 * sign as f32);
-            (difference.abs() <= JUMP_PX).then_some(difference)
+            let known = |steps: isize| {
+                let px = x.checked_add_signed(steps * sign * sx)?;
+                map.get(px, y.checked_add_signed(steps * sign * sy)?)
+            };
+            let (next, far) = (known(1)?, known(2)?);
+            let difference = (far - value) * (0.5 * sign as f32);
+            // A steep surface is even from pixel to pixel.
+            let even = (next - 0.5 * (far + value)).abs() <= 0.5 * BEND_PX;
+            (difference.abs() <= JUMP_PX || (even && difference.abs() <= STEEP_PX))
+                .then_some(difference)
         };
         match (side(-1), side(1)) {
             (Some(a), Some(b)) => 0.5 * (a + b),

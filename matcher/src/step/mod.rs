@@ -24,7 +24,8 @@ mod signature;
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, StereoStack, lanes::vectorised, parallel::PerThread};
+use crate::{Image, Level, StereoStack, lanes::vectorised, parallel::PerThread, regions::joined};
+use candidates::plane;
 use decide::Judge;
 pub use decide::{FRAMES_MIN, LIGHT_MIN, NEXT_LIGHT_MIN, SIMILARITY_MIN};
 use signature::{Signature, signature};
@@ -146,7 +147,7 @@ impl StepJudge {
                 for (nx, ny) in around(x, y, width, height) {
                     let n = ny * width + nx;
                     if verdicts.as_slice()[n] == Verdict::Kept
-                        && self.is_beside(disparity_px, nx, ny)
+                        && is_beside(stack, disparity_px, nx, ny)
                     {
                         self.beside.as_mut_slice()[n] = 1;
                         self.open.push(n as u32);
@@ -179,15 +180,7 @@ impl StepJudge {
                 )
             );
             for (x, out) in out.iter_mut().enumerate().filter(|(_, out)| **out != 0) {
-                let own = disparity_px.row(y)[x];
-                let step = |(nx, ny): (usize, usize)| {
-                    let other = disparity_px.row(ny)[nx];
-                    let hole = || {
-                        is_hidden(stack, nx, ny, own) || is_bridged(disparity_px, (x, y), (nx, ny))
-                    };
-                    is_far(other, own) && !(other.is_nan() && hole())
-                };
-                *out = u8::from(around(x, y, width, height).any(step));
+                *out = u8::from(is_beside(stack, disparity_px, x, y));
             }
         });
     }
@@ -207,13 +200,6 @@ impl StepJudge {
                 vectorised!(level, widen(column: &[u8] = column, out: &mut [u8] = out));
             });
         });
-    }
-
-    fn is_beside(&self, disparity_px: &Image<f32>, x: usize, y: usize) -> bool {
-        // Called beside pixels that changed: those are inside the mask.
-        let own = disparity_px.row(y)[x];
-        let step = |(nx, ny): (usize, usize)| is_far(disparity_px.row(ny)[nx], own);
-        !own.is_nan() && around(x, y, disparity_px.width(), disparity_px.height()).any(step)
     }
 
     /// Covariance of left and right at each pixel's own disparity, near steps but not beside them;
@@ -245,19 +231,38 @@ fn is_hidden(stack: &StereoStack<'_>, x: usize, y: usize, own_px: f32) -> bool {
         && seen(stack.right_mask, at as usize))
 }
 
+/// Whether a pixel has a step or a gap to one of its four neighbours.
+fn is_beside(stack: &StereoStack<'_>, map: &Image<f32>, x: usize, y: usize) -> bool {
+    let own = map.row(y)[x];
+    let step = |(nx, ny): (usize, usize)| {
+        let other = map.row(ny)[nx];
+        is_far(other, own)
+            && if other.is_nan() {
+                !is_hidden(stack, nx, ny, own) && !is_bridged(map, (x, y), (nx, ny))
+            } else {
+                !is_steep(map, (x, y), (nx, ny))
+            }
+    };
+    !own.is_nan() && around(x, y, map.width(), map.height()).any(step)
+}
+
 /// Whether the gap that begins at a pixel's neighbour ends at the same surface within [`BRIDGE_PX`]: a
 /// dark spot, not a silhouette.
 fn is_bridged(map: &Image<f32>, (x, y): (usize, usize), (nx, ny): (usize, usize)) -> bool {
-    let own = map.row(y)[x];
     let along = |k: usize| {
         // From x by k steps towards nx.
         let go = |from: usize, to: usize| (from + k * to).checked_sub(k * from);
         map.get(go(x, nx)?, go(y, ny)?)
     };
-    (2..=BRIDGE_PX + 1)
-        .map_while(along)
-        .find(|d| !d.is_nan())
-        .is_some_and(|d| (d - own).abs() <= 2.0 * JUMP_PX)
+    let Some((k, end)) =
+        (2..=BRIDGE_PX + 1).map_while(|k| Some((k as i32, along(k)?))).find(|(_, d)| !d.is_nan())
+    else {
+        return false;
+    };
+    let own = map.row(y)[x];
+    let (dx, dy) = (k * (nx as i32 - x as i32), k * (ny as i32 - y as i32));
+    // A steep surface goes on as a plane.
+    [own, plane(map, x, y, own).at(dx, dy)].iter().any(|d| (end - d).abs() <= 2.0 * JUMP_PX)
 }
 
 /// Whether two neighbours are on different surfaces, or one of them on none.
@@ -265,6 +270,17 @@ fn is_bridged(map: &Image<f32>, (x, y): (usize, usize), (nx, ny): (usize, usize)
 fn is_far(a: f32, b: f32) -> bool {
     let joined = (a - b).abs() <= JUMP_PX;
     !joined
+}
+
+/// Whether a pixel and its neighbour that is far from it are on one steep surface, whose slope goes on
+/// beyond one of them.
+fn is_steep(map: &Image<f32>, (x, y): (usize, usize), (nx, ny): (usize, usize)) -> bool {
+    let at = |x: Option<usize>, y: Option<usize>| {
+        x.zip(y).and_then(|(x, y)| map.get(x, y)).unwrap_or(f32::NAN)
+    };
+    let before = at((2 * x).checked_sub(nx), (2 * y).checked_sub(ny));
+    let after = at((2 * nx).checked_sub(x), (2 * ny).checked_sub(y));
+    joined(before, map.row(y)[x], map.row(ny)[nx], after)
 }
 
 /// Marks the middle row's valid pixels with a step or a gap to one of their four neighbours.
