@@ -1,5 +1,7 @@
 //! The fast path: coarse search by descriptors, then dense least squares.
 
+mod pace;
+
 use rayon::prelude::*;
 
 use crate::{
@@ -7,7 +9,7 @@ use crate::{
     coarse::{Coarse, CoarseMap, INVALID},
     dense::{
         DenseFit, DenseMaps, mark_steps,
-        motion::MotionFit,
+        motion::{FRAMES_MIN, MotionFit},
         order::{OrderChoice, accept},
         settle::Settle,
     },
@@ -57,12 +59,52 @@ impl Fast {
 
     /// Fills the maps of `out` from a checked stack; the rate is in px per second, or per frame where
     /// the stack has no times. `done` is told the name of each stage at its end.
+    ///
+    /// Where motion is estimated and turns out too fast for the frames given, the newest half of them
+    /// is matched instead, and of these again; a scene too fast for three gives nothing.
     pub(crate) fn run(
         &mut self,
         stack: &StereoStack<'_>,
         out: &mut Matched,
         mut done: impl FnMut(&'static str),
     ) {
+        let in_order = stack.times_s.is_none_or(|times| times.is_sorted());
+        let all = stack.frames();
+        let mut frames = all;
+        loop {
+            let part = pace::newest(stack, frames);
+            let rate = self.once(&part, out, &mut done);
+            if !self.params.motion || !in_order || all <= FRAMES_MIN {
+                return;
+            }
+            let last = frames <= FRAMES_MIN;
+            let fewer = if last { FRAMES_MIN - 1 } else { frames.div_ceil(2).max(FRAMES_MIN) };
+            let found = (&out.disparity_px, rate.as_ref());
+            let (level, range) = (self.level, self.params.disparity);
+            let too_fast = pace::travels(&part, found)
+                || pace::loses(level, range, &part, &pace::newest(stack, fewer), found);
+            if !too_fast {
+                return;
+            }
+            if last {
+                // Nothing rather than something wrong.
+                let rates = out.rate_px_per_s.iter_mut();
+                for map in [&mut out.disparity_px, &mut out.zncc].into_iter().chain(rates) {
+                    map.as_mut_slice().fill(f32::NAN);
+                }
+                return;
+            }
+            frames = fewer;
+        }
+    }
+
+    /// One match of a stack; gives the rate.
+    fn once(
+        &mut self,
+        stack: &StereoStack<'_>,
+        out: &mut Matched,
+        mut done: impl FnMut(&'static str),
+    ) -> Option<Image<f32>> {
         let (width, height) = (stack.width(), stack.height());
         if (self.start.width(), self.start.height()) != (width, height) {
             self.start = Image::new(width, height, f32::NAN);
@@ -124,6 +166,7 @@ impl Fast {
             out.rate_px_per_s = None;
         }
         done("regions");
+        rate
     }
 }
 

@@ -2,11 +2,15 @@
 
 use std::{
     alloc::{GlobalAlloc, Layout, System},
-    sync::atomic::{AtomicUsize, Ordering::Relaxed},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicUsize, Ordering::Relaxed},
+    },
 };
 
 use stspp_matcher::{
-    DisparityRange, Matched, Matcher, Method, Params, ShapeFunction, StereoStack, synthetic::Scene,
+    DisparityRange, Image, Matched, Matcher, Method, Params, Sample, ShapeFunction, StereoStack,
+    synthetic::{Random, Scene},
 };
 
 /// Counts what is asked of the system's allocator.
@@ -35,6 +39,9 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
+/// The counters are the process's: one test at a time.
+static ALONE: Mutex<()> = Mutex::new(());
+
 /// What the thread pool's queues may take in a frame: they grow by blocks now and then.
 const QUEUES: usize = 16 << 10;
 /// Bytes a pixel that the matcher holds at most, in maps and descriptors: 125 MiB in a full frame.
@@ -42,6 +49,7 @@ const BYTES_PER_PIXEL: usize = 100;
 
 #[test]
 fn no_memory_is_taken_after_the_first_frame() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     for (shape, frames, motion, settle) in [
         (ShapeFunction::First, 10, false, false),
         (ShapeFunction::Auto, 5, false, false),
@@ -78,4 +86,30 @@ fn no_memory_is_taken_after_the_first_frame() {
         // A thread's tile does not grow with the image's height.
         assert!(peak <= BYTES_PER_PIXEL * 480 * 200 + (16 << 20), "{peak} bytes");
     }
+}
+
+/// Images of the sensor's size and ten frames: what the matcher holds, and with the window's images.
+#[test]
+fn a_full_frame_stays_below_the_limit() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    const MIB: f64 = 1_048_576.0;
+    let (width, height, frames) = (1280, 1024, 10);
+    let mut random = Random::new(3);
+    // Memory depends on sizes alone: one picture without noise serves for all.
+    let image = Image::new(width, height, 0).map(|_: Sample| (random.bits() % 8000) as Sample);
+    let images = vec![&image; frames];
+    let times: Vec<f64> = (0..frames).map(|k| k as f64 / 30.0).collect();
+    let mut params = Params::new(DisparityRange { min_px: -400, max_px: 119 });
+    (params.method, params.shape) = (Method::Dense, ShapeFunction::Auto);
+    params.advanced.threads = Some(2);
+    let before = HELD.load(Relaxed);
+    PEAK.store(before, Relaxed);
+    let mut matcher = Matcher::new(params).unwrap();
+    let mut out = Matched::default();
+    let stack = StereoStack { times_s: Some(&times), ..StereoStack::new(&images, &images) };
+    matcher.match_into(&stack, &mut out).unwrap();
+    let peak = (PEAK.load(Relaxed) - before) as f64 / MIB;
+    let window = (2 * frames * width * height * size_of::<Sample>()) as f64 / MIB;
+    println!("full frame: matcher {peak:.0} MiB, with its window {:.0} MiB", peak + window);
+    assert!(peak + window < 350.0, "{peak} + {window} MiB");
 }

@@ -97,6 +97,37 @@ fn a_moving_plane_measures_as_one_at_rest() {
     }
 }
 
+/// Faster motion is measured by fewer frames, with more noise; what is too fast for three is not found.
+/// 0.22 px a frame are 9 mm/s at 1 m and 30 frames a second.
+#[test]
+fn fast_motion_is_measured_by_fewer_frames_and_beyond_that_not_at_all() {
+    let mut whole = 0.0;
+    for rate in [0.0, 0.3, 0.36, 0.5, 0.6, 0.75, 1.0, 1.5, 3.0] {
+        let scene = plane(rate).render();
+        let found = run(&scene, params(ShapeFunction::Auto));
+        let truth = truth_of(&scene);
+        let (bias, scatter, n) = errors(&found.disparity_px, &truth, everywhere);
+        let off = |x: usize, y: usize| {
+            (f64::from(found.disparity_px.row(y)[x]) - truth(x, y)).abs() > 1.0
+        };
+        let (_, _, wrong) = errors(&found.disparity_px, &truth, off);
+        if rate == 0.0 {
+            whole = n;
+        }
+        println!(
+            "{rate} px a frame, {:.0} mm/s: {:.2} % found, {:.3} % wrong by more than 1 px, \
+             bias {bias:.4}, scatter {scatter:.4} px",
+            rate / RATE_PX * 9.0,
+            100.0 * n / whole,
+            100.0 * wrong / whole,
+        );
+        // Up to 31 mm/s all is found; what is wrong at any speed is lost, but for single pixels.
+        assert!(wrong < 0.001 * whole, "{rate}: {wrong} of {whole} wrong");
+        assert!(rate > 0.8 || n > 0.99 * whole, "{rate}: {n} of {whole} found");
+        assert!(rate > 0.8 || (bias.abs() < 0.005 && scatter < 0.02), "{rate}: {bias} {scatter}");
+    }
+}
+
 #[test]
 fn at_rest_the_rate_is_zero_and_the_disparity_untouched() {
     let scene = plane(0.0).render();

@@ -12,6 +12,7 @@ mod search;
 
 use crate::{DisparityRange, Image, Level, StereoStack, parallel::PerThread};
 use descriptor::Descriptors;
+pub(crate) use search::is_dark;
 use search::{Scene, Search};
 
 /// A disparity that is none.

@@ -316,7 +316,7 @@ fn write_row(
 }
 
 /// Whether no dot ever lights the pixel or its neighbours two pixels away.
-fn is_dark(images: &[&Image<Sample>], x: usize, y: usize) -> bool {
+pub(crate) fn is_dark(images: &[&Image<Sample>], x: usize, y: usize) -> bool {
     let (width, height) = (images[0].width(), images[0].height());
     let columns = [x.saturating_sub(2), x, (x + 2).min(width - 1)];
     let rows = [y.saturating_sub(2), (y + 2).min(height - 1)];

@@ -47,6 +47,7 @@ pub(crate) struct Static<'a> {
 /// Fills `out` for pixels `x0..x0 + len` of the rows in `left`: an even number of rows of the
 /// image's width (a last odd frame is followed by a row of zeros). Pixels beyond the image get
 /// zeros, and so do gradients within [`REACH`] of its sides.
+#[cfg_attr(not(target_arch = "x86_64"), allow(unused_variables, unreachable_code))]
 pub(crate) fn static_row(
     level: Level,
     left: &[&[Sample]],

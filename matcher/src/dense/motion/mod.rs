@@ -33,7 +33,7 @@ use sums::{Blocks, Frame};
 /// Pixels of a block's side.
 pub(crate) const BLOCK: usize = 16;
 /// Fewest frames whose motion is estimated.
-const FRAMES_MIN: usize = 3;
+pub(crate) const FRAMES_MIN: usize = 3;
 /// Rounds of the rate before the fit: the first one sees frames up to a pixel off.
 const ROUNDS: usize = 2;
 
