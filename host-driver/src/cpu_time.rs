@@ -1,6 +1,6 @@
 //! Wall and CPU time of the steps of a job.
 
-use stspp_matcher::cpu_time::process_cpu_ms;
+pub use stspp_matcher::cpu_time::process_cpu_ms;
 
 /// Wall and CPU time of the steps of a job.
 #[derive(Debug)]

@@ -17,7 +17,7 @@ const BLUR_MAX_PX: f64 = 1.5;
 /// Share of the points of an image whose white may be cut off.
 const SATURATED_MAX: f64 = 0.05;
 /// Contrast of white and black, in grey values of 8 bits, below which images are too dark.
-const CONTRAST_MIN: f64 = 12.0;
+pub(super) const CONTRAST_MIN: f64 = 12.0;
 /// Deviation of the baseline from what the sensor was built with.
 const BASELINE_TOLERANCE: f64 = 0.02;
 /// Deviation of a view's triangulated board from the stated size.
@@ -152,7 +152,10 @@ fn of_images(observations: &Observations, images: &[Images], found: &mut Vec<Fin
     );
     add(
         Kind::Dark,
-        named(&|pair| any_quality(pair, &|q| q.white - q.black < CONTRAST_MIN)),
+        named(&|pair| {
+            any_quality(pair, &|q| q.white - q.black < CONTRAST_MIN)
+                || any_problem(pair, &|p| matches!(p, Problem::Dark { .. }))
+        }),
         "are too dark: lengthen the exposure or bring the board nearer",
     );
     add(

@@ -9,6 +9,7 @@ mod refine;
 
 use serde::Serialize;
 
+use super::findings::CONTRAST_MIN;
 use super::observations::Sighting;
 use super::{Board, Pattern};
 use crate::RawImage;
@@ -94,6 +95,12 @@ pub enum Problem {
         /// How many.
         markers: usize,
     },
+    /// There is hardly any light in the image.
+    #[error("the image is dark: its brightest parts are {contrast} of 255 above its darkest")]
+    Dark {
+        /// Grey values between dark and bright, of 255.
+        contrast: u8,
+    },
     /// The image cannot be searched.
     #[error("the image cannot be searched: {0}")]
     Detector(String),
@@ -108,8 +115,49 @@ pub fn detect(raw: &RawImage, board: &Board) -> Result<Detection, Problem> {
         return Err(Problem::NoBoard { corners: 0 });
     }
     let gray = Gray::new(raw);
-    match board.pattern {
+    let found = match board.pattern {
         Pattern::Charuco => charuco::detect(&gray, board),
         Pattern::Circles => circles::detect(&gray, board),
+    };
+    // In the dark nothing can be said of the board.
+    found.map_err(|problem| match contrast(&gray) {
+        contrast if f64::from(contrast) < CONTRAST_MIN => Problem::Dark { contrast },
+        _ => problem,
+    })
+}
+
+/// Grey values between the darkest and the brightest hundredth of an image.
+fn contrast(gray: &Gray) -> u8 {
+    let mut counts = [0_usize; 256];
+    gray.to_u8().into_iter().for_each(|value| counts[usize::from(value)] += 1);
+    let hundredth = gray.pixels.as_slice().len() / 100;
+    // The first value, counted from one end, beyond a hundredth of the pixels.
+    let beyond = |value_at: fn(usize) -> usize| {
+        let mut passed = 0;
+        (0..256)
+            .map(value_at)
+            .find(|value| {
+                passed += counts[*value];
+                passed > hundredth
+            })
+            .unwrap_or(0)
+    };
+    let (dark, bright) = (beyond(|k| k), beyond(|k| 255 - k));
+    bright.saturating_sub(dark) as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dark_image_is_said_to_be_dark_and_a_blank_one_not_to_hold_a_board() {
+        let board = Board::default();
+        let image = |bright: u8| {
+            let pixels = (0..200 * 150).map(|k| if k / 20 % 2 == 0 { 3 } else { bright }).collect();
+            RawImage::gray8(stspp_matcher::Image::from_vec(200, 150, pixels).expect("size"))
+        };
+        assert_eq!(detect(&image(8), &board), Err(Problem::Dark { contrast: 5 }));
+        assert!(!matches!(detect(&image(120), &board), Err(Problem::Dark { .. })));
     }
 }
