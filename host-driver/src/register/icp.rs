@@ -86,7 +86,7 @@ const LEAST_PAIRS: usize = 12;
 /// off by the noise over the root of its points, so that few steps remain on the next.
 const LEVEL: usize = 8;
 /// A move of this share of the points' distance leaves nearly all pairs as they are.
-const PAIRS_HOLD: f64 = 0.02;
+const PAIRS_HOLD: f64 = 0.005;
 
 /// Registers the finite points of `source_m` on `target`, starting from `target_from_source`.
 ///
