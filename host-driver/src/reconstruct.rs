@@ -32,6 +32,8 @@ pub struct Options {
     pub first: usize,
     /// Threads of the matcher; all cores when `None`.
     pub threads: Option<usize>,
+    /// Whether the dense method lets the pixels' own grey values decide at depth steps.
+    pub settle_steps: bool,
 }
 
 /// Why a recording has no depth.
@@ -191,6 +193,7 @@ pub fn reconstruct(
     params.method = options.method;
     params.shape = options.shape;
     params.advanced.threads = options.threads;
+    params.advanced.settle_steps = options.settle_steps;
     let mut matcher = Matcher::new(params)?;
     let matched = stack.matched(&mut matcher, 0..stack.len())?;
     watch.step("match");

@@ -78,6 +78,7 @@ pub fn params_json(params: &Params) -> Value {
         "convergence_px": a.convergence_px,
         "iterations_max": a.iterations_max,
         "left_right_px": a.left_right_px,
+        "settle_steps": a.settle_steps,
     })
 }
 

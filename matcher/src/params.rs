@@ -100,8 +100,8 @@ pub struct Advanced {
     /// from the local fit.
     pub surface_px: f32,
     /// Whether [`Method::Dense`] lets the pixels' own grey values decide at depth steps, as
-    /// [`Method::IcGn`] always does; from six frames on. On the simulated part 0.1 % of the points are
-    /// then wrong instead of 2.7 %, 1 % fewer are found, and a frame takes half as long again.
+    /// [`Method::IcGn`] always does; from six frames on. On the simulated part 0.2 % of the points are
+    /// then wrong instead of 2.7 %, 1 % fewer are found, and a frame takes a quarter longer.
     pub settle_steps: bool,
     /// Interpolation of the right images in IC-GN.
     pub interpolation: Interpolation,

@@ -155,7 +155,7 @@ impl Field {
         let width = self.width;
         let (disparity_px, verdicts) = self.judge_steps(map, stack, level);
         let moved = |i: usize| verdicts.as_slice()[i] == Verdict::Moved;
-        let Some(judge) = &self.judge else { return };
+        let Some(judge) = &mut self.judge else { return };
         let near = judge.near();
         let open: Vec<u32> = (0..self.points.len() as u32)
             .into_par_iter()

@@ -1,7 +1,7 @@
 //! The verdict on one pixel.
 
 use super::{
-    ALONG_PX, INSIDE_RADIUS, STEEP,
+    ALONG_PX, STEEP,
     candidates::{Candidate, Candidates, own},
     signature::{Signature, signature},
 };
@@ -27,16 +27,14 @@ pub const SIMILARITY_MIN: f32 = 0.88;
 /// Least similarity for a pixel to be moved to another surface.
 pub const MOVED_SIMILARITY_MIN: f32 = 0.9;
 
-/// Fewest pixels that the light inside a surface is taken from.
-const INSIDE_MIN: usize = 3;
+/// How far beyond the next pixel the light inside a surface is taken.
+const INSIDE_STEPS: i32 = 3;
 
 /// What verdicts are made from.
 pub(super) struct Judge<'a> {
     pub stack: &'a StereoStack<'a>,
     pub disparity_px: &'a Image<f32>,
     pub beside: &'a Image<u8>,
-    /// Covariance at the pixels' own disparities inside surfaces; NaN elsewhere.
-    pub light: &'a [f32],
 }
 
 /// How well a surface explains a pixel.
@@ -68,10 +66,11 @@ impl Judge<'_> {
         let own_px = self.disparity_px.row(y)[x];
         let own = own(self.disparity_px, x, y);
         // Where the right camera's view ends, nothing can be said.
-        let own_evidence = self.evidence(x, y, &own)?;
+        let own_evidence = self.evidence(x, y, &own, SIMILARITY_MIN)?;
         let mut best: Option<(Evidence, f32)> = None;
         for other in Candidates::around(self.disparity_px, x, y, &own).iter() {
-            let Some(evidence) = self.evidence(x, y, other).filter(Evidence::convinces) else {
+            let evidence = self.evidence(x, y, other, MOVED_SIMILARITY_MIN);
+            let Some(evidence) = evidence.filter(Evidence::convinces) else {
                 continue;
             };
             if best.is_none_or(|(b, _)| evidence.similarity > b.similarity) {
@@ -97,15 +96,16 @@ impl Judge<'_> {
     }
 
     /// Pools the pixel and its two neighbours along the step; `None` where the right camera
-    /// does not see the candidate.
-    fn evidence(&self, x: usize, y: usize, candidate: &Candidate) -> Option<Evidence> {
+    /// does not see the candidate. Below a similarity of `least` nothing else is looked at.
+    fn evidence(&self, x: usize, y: usize, candidate: &Candidate, least: f32) -> Option<Evidence> {
         let own_px = self.disparity_px.row(y)[x];
-        let mut pooled = Signature::default();
-        let (mut next, mut count) = (0.0, 0);
         // The row along the step: across the direction inwards.
         let (ix, iy) = (candidate.inwards.0.signum(), candidate.inwards.1.signum());
         let along = [(0, 0), (-iy, ix), (iy, -ix)];
-        for &(dx, dy) in if (ix, iy) == (0, 0) { &along[..1] } else { &along[..] } {
+        let along = if (ix, iy) == (0, 0) { &along[..1] } else { &along[..] };
+        let mut pooled = Signature::default();
+        let mut found = [(0, 0, 0.0, f32::NAN); 3];
+        for (&(dx, dy), found) in along.iter().zip(&mut found) {
             let at = (x.checked_add_signed(dx as isize), y.checked_add_signed(dy as isize));
             let (Some(px), Some(py)) = at else { continue };
             // Neighbours beside the same step; NaN is not.
@@ -114,55 +114,49 @@ impl Judge<'_> {
             if !same {
                 continue;
             }
-            if let Some(one) = signature(self.stack, px, py, candidate.at(dx, dy)) {
+            let at_px = candidate.at(dx, dy);
+            if let Some(one) = signature(self.stack, px, py, at_px) {
                 pooled.add(&one);
-                next += self.next(px, py, candidate.at(dx, dy), candidate);
-                count += 1;
+                *found = (px, py, at_px, one.cov);
             }
         }
-        if count == 0 {
-            return None;
+        let found = || found.iter().filter(|(.., cov)| !cov.is_nan());
+        found().next()?;
+        let similarity = pooled.similarity();
+        let none = Evidence { light: 0.0, next_light: 0.0, similarity };
+        if similarity < least {
+            return Some(none);
         }
-        let inside = self.inside(x, y, candidate);
-        let light = inside.map_or(1.0, |inside| pooled.cov / (count as f32 * inside));
+        let (mut next, mut inside, mut inside_own) = (0.0, 0.0, 0.0);
+        for &(px, py, at_px, cov) in found() {
+            next += self.inwards(px, py, at_px, candidate, 0);
+            let deep = self.inwards(px, py, at_px, candidate, INSIDE_STEPS);
+            if !deep.is_nan() {
+                (inside, inside_own) = (inside + deep, inside_own + cov);
+            }
+        }
+        let light = if inside > 0.0 { inside_own / inside } else { 1.0 };
         // NaN where a pixel has no next one: no comparison holds then.
         let known = next > 0.0 && candidate.inwards != (0, 0);
         let next_light = if known { pooled.cov / next } else { 1.0 };
-        Some(Evidence { light, next_light, similarity: pooled.similarity() })
+        Some(Evidence { light, next_light, similarity })
     }
 
     /// Light of the pixel inwards of (x, y) on the candidate's surface, whose disparity at (x, y) is
-    /// `at_px`; NaN where there is none.
-    fn next(&self, x: usize, y: usize, at_px: f32, candidate: &Candidate) -> f32 {
-        let (dx, dy) = candidate.inwards;
+    /// `at_px`, or of the one that is `beyond` pixels farther; NaN where there is none.
+    fn inwards(&self, x: usize, y: usize, at_px: f32, candidate: &Candidate, beyond: i32) -> f32 {
+        let (ix, iy) = candidate.inwards;
+        let (dx, dy) = (ix + beyond * ix.signum(), iy + beyond * iy.signum());
         let at = (x.checked_add_signed(dx as isize), y.checked_add_signed(dy as isize));
         let (Some(px), Some(py)) = at else { return f32::NAN };
         let Some(known) = self.disparity_px.get(px, py) else { return f32::NAN };
         let limit = ALONG_PX + STEEP * dx.abs().max(dy.abs()) as f32;
-        // Where the map has another surface there, this one is continued.
         let on = (known - at_px).abs() < limit;
+        if beyond > 0 && !on {
+            return f32::NAN;
+        }
+        // Where the map has another surface next to the pixel, this one is continued.
         let disparity_px = if on { known } else { at_px };
         signature(self.stack, px, py, disparity_px).map_or(f32::NAN, |s| s.cov)
-    }
-
-    /// Mean light of the candidate's surface around the pixel, away from steps.
-    fn inside(&self, x: usize, y: usize, candidate: &Candidate) -> Option<f32> {
-        let (width, height) = (self.disparity_px.width(), self.disparity_px.height());
-        let r = INSIDE_RADIUS;
-        let (mut sum, mut count) = (0.0, 0);
-        for py in y.saturating_sub(r)..(y + r + 1).min(height) {
-            let dy = py as i32 - y as i32;
-            for px in x.saturating_sub(r)..(x + r + 1).min(width) {
-                let dx = px as i32 - x as i32;
-                let light = self.light[py * width + px];
-                let off = (self.disparity_px.row(py)[px] - candidate.disparity_px).abs();
-                let limit = ALONG_PX + STEEP * dx.abs().max(dy.abs()) as f32;
-                if off < limit && !light.is_nan() {
-                    sum += light;
-                    count += 1;
-                }
-            }
-        }
-        (count >= INSIDE_MIN && sum > 0.0).then(|| sum / count as f32)
     }
 }

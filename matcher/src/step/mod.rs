@@ -28,7 +28,6 @@ use crate::{Image, Level, StereoStack, lanes::vectorised, parallel::PerThread, r
 use candidates::plane;
 use decide::Judge;
 pub use decide::{FRAMES_MIN, LIGHT_MIN, NEXT_LIGHT_MIN, SIMILARITY_MIN};
-use signature::{Signature, signature};
 
 /// Disparities of neighbours that differ by more belong to different surfaces.
 pub const JUMP_PX: f32 = 1.5;
@@ -41,15 +40,11 @@ const STEEP: f32 = 0.75;
 /// How deep a surface is peeled: fattening is up to two pixels wide.
 pub const PASSES: usize = 2;
 
-/// How far from a step pixels may be of use: the light inside surfaces is taken there, and windows of
-/// the usual size reach the step.
-pub const NEAR_RADIUS: usize = INSIDE_RADIUS + 1;
+/// How far from a step the windows of the usual size reach it.
+pub const NEAR_RADIUS: usize = 5;
 
 /// Gaps up to this wide with the same surface on both sides are dark spots.
 const BRIDGE_PX: usize = 8;
-
-/// Radius of the window that the light inside a surface is averaged over.
-const INSIDE_RADIUS: usize = 4;
 
 /// A pixel of [`StepJudge::judge`]'s verdicts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -69,7 +64,6 @@ pub struct StepJudge {
     level: Level,
     near: Image<u8>,
     beside: Image<u8>,
-    light: Vec<f32>,
     /// Pixels to judge in a pass, and what takes their disparity's place.
     open: Vec<u32>,
     proposals: Vec<Option<Option<f32>>>,
@@ -84,7 +78,6 @@ impl StepJudge {
             level: level.usable(),
             near: none(),
             beside: none(),
-            light: Vec::new(),
             open: Vec::new(),
             proposals: Vec::new(),
             columns: PerThread::default(),
@@ -112,18 +105,16 @@ impl StepJudge {
             self.beside = Image::new(width, height, 0);
             self.near = Image::new(width, height, 0);
         }
-        self.near.as_mut_slice().fill(0);
         if stack.frames() < FRAMES_MIN {
+            self.beside.as_mut_slice().fill(0);
             return;
         }
         self.mark_beside(stack, disparity_px);
-        self.mark_near();
-        self.measure_light(stack, disparity_px);
         self.open.clear();
         let marks = self.beside.as_slice().iter().enumerate();
         self.open.extend(marks.filter(|(_, b)| **b != 0).map(|(i, _)| i as u32));
         for _ in 0..PASSES {
-            let judge = Judge { stack, disparity_px, beside: &self.beside, light: &self.light };
+            let judge = Judge { stack, disparity_px, beside: &self.beside };
             self.proposals.resize(self.open.len(), None);
             self.open.par_iter().zip(&mut self.proposals).with_min_len(64).for_each(|(&i, to)| {
                 *to = judge.pixel(i as usize % width, i as usize / width);
@@ -160,9 +151,10 @@ impl StepJudge {
         }
     }
 
-    /// The pixels (non-zero) near the steps of the last map judged, as it was before: subsets there
-    /// may hold another surface.
-    pub fn near(&self) -> &Image<u8> {
+    /// The pixels (non-zero) near the steps of the last map judged: subsets there may hold another
+    /// surface.
+    pub fn near(&mut self) -> &Image<u8> {
+        self.mark_near();
         &self.near
     }
 
@@ -199,23 +191,6 @@ impl StepJudge {
                 }
                 vectorised!(level, widen(column: &[u8] = column, out: &mut [u8] = out));
             });
-        });
-    }
-
-    /// Covariance of left and right at each pixel's own disparity, near steps but not beside them;
-    /// NaN elsewhere.
-    fn measure_light(&mut self, stack: &StereoStack<'_>, disparity_px: &Image<f32>) {
-        let (width, height) = (disparity_px.width(), disparity_px.height());
-        self.light.resize(width * height, f32::NAN);
-        let (near, beside) = (&self.near, &self.beside);
-        self.light.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
-            out.fill(f32::NAN);
-            for (x, out) in out.iter_mut().enumerate() {
-                let d = disparity_px.row(y)[x];
-                if near.row(y)[x] != 0 && beside.row(y)[x] == 0 && !d.is_nan() {
-                    *out = signature(stack, x, y, d).map_or(f32::NAN, |s: Signature| s.cov);
-                }
-            }
         });
     }
 }

@@ -60,6 +60,10 @@ pub struct Matching {
     /// Threads to use [default: all cores].
     #[arg(long)]
     pub threads: Option<usize>,
+    /// With `--method dense`: let the pixels' own grey values decide at depth steps, as `icgn` always
+    /// does.
+    #[arg(long)]
+    pub settle_steps: bool,
 }
 
 /// Names of [`Method`].
@@ -120,6 +124,7 @@ impl Matching {
             frames: self.frames,
             first: 0,
             threads: self.threads,
+            settle_steps: self.settle_steps,
         }
     }
 }

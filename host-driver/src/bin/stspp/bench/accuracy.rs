@@ -27,9 +27,6 @@ pub struct Args {
     /// Seed of the simulated sensor: other dots, tolerances and noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// With `--method dense`: let the pixels' own grey values decide at depth steps, as `icgn` always does.
-    #[arg(long)]
-    settle_steps: bool,
     #[command(flatten)]
     matching: Matching,
 }
@@ -57,7 +54,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         method: options.method,
         shape: options.shape,
         threads: options.threads,
-        settle_steps: args.settle_steps,
+        settle_steps: options.settle_steps,
     };
     let frames = args.matching.frames.unwrap_or(10);
     let spinner = output.spinner();
