@@ -33,8 +33,12 @@ struct Key {
 
 impl Key {
     fn of(exposure: &Exposure, gain_percent: u32) -> Self {
-        // The chip's edges jitter by less than the microsecond that is kept.
-        let us = |ns: u64| (ns + 500) / 1000;
+        // Crystals differ by millionths and edges jitter by less than a microsecond: times that are equal
+        // but for that are one key. A two-thousandth of the light is far less than a grey value.
+        let us = |ns: u64| {
+            let step_ns = (ns / 2000).next_multiple_of(1000).max(1000);
+            (ns + step_ns / 2) / step_ns * step_ns / 1000
+        };
         let mut lights_us: Vec<_> = exposure
             .lights
             .iter()

@@ -46,6 +46,8 @@ pub struct Lock {
     pub points_ns: Vec<(u64, u64)>,
     /// (frame sequence, arrival after the exposure's end in nanoseconds) of the same frames.
     pub latencies_ns: Vec<(u32, i64)>,
+    /// Whether the bus's frame numbers say so, and nothing else was needed.
+    pub proven: bool,
 }
 
 /// Newest events that tie the host's clock to the device's. When the host's clock has stepped, events of
@@ -82,9 +84,12 @@ pub fn find(triggers: &[Trigger], frames: &[FrameStamp], config: &LockConfig) ->
     let mut found: Vec<(&FrameStamp, &Trigger, i64)> = Vec::new();
     for frame in frames {
         let arrival_ns = frame.timestamp_camera_ns.wrapping_add_signed(host_from_camera_ns) as i64;
-        let candidate = triggers.iter().rev().find(|t| {
-            t.sof_agrees(frame) != Some(false)
-                && exposure_end_host_ns(t) <= arrival_ns + config.slack_ns as i64
+        // Where the bus's frame number agrees, it is enough that the frame came after its event: both
+        // offsets are wrong for a host that gets slower and slower.
+        let candidate = triggers.iter().rev().find(|t| match t.sof_agrees(frame) {
+            Some(false) => false,
+            Some(true) if t.arrival_host_ns <= frame.arrival_host_ns + config.slack_ns => true,
+            _ => exposure_end_host_ns(t) <= arrival_ns + config.slack_ns as i64,
         });
         if let Some(trigger) = candidate {
             let latency_ns = arrival_ns - exposure_end_host_ns(trigger);
@@ -130,7 +135,7 @@ pub fn find(triggers: &[Trigger], frames: &[FrameStamp], config: &LockConfig) ->
         .iter()
         .map(|(f, t, _)| (f.sequence, f.arrival_host_ns as i64 - exposure_end_host_ns(t)))
         .collect();
-    Some(Lock { offset: newest, latency_ns, points_ns, latencies_ns })
+    Some(Lock { offset: newest, latency_ns, points_ns, latencies_ns, proven })
 }
 
 #[cfg(test)]
@@ -214,6 +219,22 @@ mod tests {
         // The first exposure was missed and every frame is three periods late: only the bus knows.
         let frames: Vec<_> = (0..4).map(with_sof).collect();
         assert_eq!(find(&triggers, &frames, &CONFIG).map(|lock| lock.offset), Some(1));
+    }
+
+    #[test]
+    fn frame_numbers_of_the_bus_lock_frames_of_a_host_that_gets_slower() {
+        // Each slot takes half a second of the host's time more than of the device's.
+        let slower = |of: u32| u64::from(of) * 500_000_000;
+        let triggers: Vec<_> = (0..13)
+            .map(|k| Trigger {
+                arrival_host_ns: trigger(k).arrival_host_ns + slower(k),
+                ..trigger(k)
+            })
+            .collect();
+        let frames: Vec<_> = (0..10)
+            .map(|k| FrameStamp { usb_sof: trigger(k).usb_sof, ..frame(k, k, slower(k + 2)) })
+            .collect();
+        assert_eq!(find(&triggers, &frames, &CONFIG).map(|lock| lock.offset), Some(0));
     }
 
     #[test]

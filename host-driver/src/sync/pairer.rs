@@ -166,6 +166,8 @@ struct Tied {
     offset: i64,
     /// (sequence, delay after the exposure's end) of the last frames that were used.
     recent: VecDeque<(u32, i64)>,
+    /// Whether the bus's frame numbers tied it.
+    proven: bool,
     changed: Option<(i64, u32)>,
     misfits: u32,
 }
@@ -348,12 +350,16 @@ impl<F> Pairer<F> {
             counted_offset: camera.counted_offset,
         };
         let Some(lock) = lock::find(&triggers, &stamps, &config) else { return };
-        // Two cameras of one sensor are read out alike: half a period apart, one of them is off.
+        // Two cameras of one sensor are read out alike: half a period apart, one of them is off. Not so
+        // where the bus's frame number decides: a slow host fetches one picture long after the other.
         let other = &self.cameras[1 - side.index()];
-        if other.tied.as_ref().is_some_and(|tied| {
+        let apart = other.tied.as_ref().filter(|tied| {
             (tied.latency_ns() - lock.latency_ns).unsigned_abs() > self.config.period_ns / 2
-        }) {
-            self.unlock(Side::BOTH[1 - side.index()], out);
+        });
+        if let Some(tied) = apart.filter(|_| !lock.proven) {
+            if !tied.proven {
+                self.unlock(Side::BOTH[1 - side.index()], out);
+            }
             return;
         }
         let mut fit = ClockFit::default();
@@ -365,6 +371,7 @@ impl<F> Pairer<F> {
             fit,
             offset: lock.offset,
             recent: lock.latencies_ns.into_iter().collect(),
+            proven: lock.proven,
             changed: None,
             misfits: 0,
         });

@@ -41,15 +41,17 @@ pub struct Bench {
     pub folder: PathBuf,
     /// The cameras have 1/scale of the pixels in each direction.
     pub scale: u32,
+    /// How many times slower than an idle machine this one is: programs in the guest get so much more time.
+    pub slowness: f64,
     /// The same scenes captured without USB, by their scale, once computed.
     pub in_process: BTreeMap<u32, Score>,
 }
 
 impl Bench {
     /// A bench whose devices are not plugged in yet.
-    pub fn new(machine: Machine, server: Server, folder: &Path) -> Self {
+    pub fn new(machine: Machine, server: Server, folder: &Path, slowness: f64) -> Self {
         let (folder, in_process) = (folder.to_owned(), BTreeMap::new());
-        Self { machine, server, folder, scale: SCENE_SCALE, in_process }
+        Self { machine, server, folder, scale: SCENE_SCALE, slowness, in_process }
     }
 
     /// Plugs all devices in, and gives the guest their calibration.
@@ -145,12 +147,17 @@ impl Bench {
             .is_some_and(|all| all.iter().any(|s| s["kind"] == "usb" && !s["serial"].is_null())))
     }
 
+    /// What an idle machine would do in `seconds`, in words.
+    fn patience_s(&self, seconds: u32) -> String {
+        ((f64::from(seconds) * self.slowness) as u32).to_string()
+    }
+
     /// A program in the guest that must succeed; its output.
     ///
     /// # Errors
     /// Its exit code and output.
     pub fn run(&mut self, seconds: u32, program: &str, words: &[&str]) -> Result<String, String> {
-        let seconds = seconds.to_string();
+        let seconds = self.patience_s(seconds);
         let mut request = vec!["run", &seconds, program];
         request.extend(words);
         let reply = self.machine.request(&request)?;
@@ -167,7 +174,7 @@ impl Bench {
     /// # Errors
     /// When the machine does not answer.
     pub fn stspp(&mut self, seconds: u32, words: &[&str]) -> Result<Reply, String> {
-        let seconds = seconds.to_string();
+        let seconds = self.patience_s(seconds);
         let mut request = vec!["run", &seconds, "/bin/stspp"];
         request.extend(words);
         self.machine.request(&request)
@@ -196,8 +203,8 @@ impl Bench {
     /// # Errors
     /// When the machine does not answer.
     pub fn start_stream(&mut self, count: &str, more: &[&str]) -> Result<(), String> {
-        let source = self.source();
-        let mut words = vec!["run", "60", "/bin/stspp", "stream", "--pairs", "--json"];
+        let (source, seconds) = (self.source(), self.patience_s(60));
+        let mut words = vec!["run", &seconds, "/bin/stspp", "stream", "--pairs", "--json"];
         words.extend(["--timeout", TIMEOUT_S, "--source", &source, "-n", count]);
         words.extend(more);
         self.machine.send(&words)

@@ -9,7 +9,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Longest wait for an answer: more than any program in the guest may take.
-const PATIENCE: Duration = Duration::from_secs(200);
+const PATIENCE: Duration = Duration::from_secs(800);
 
 /// All that QEMU can emulate, but for "enhanced rep movsb": kernel and C library copy memory by that
 /// instruction where it is there, and QEMU emulates it byte by byte. Without it both copy by words,
@@ -67,7 +67,7 @@ impl Machine {
             .arg(kernel)
             .arg("-initrd")
             .arg(initrd)
-            .args(["-append", "console=ttyS0 quiet panic=-1 mitigations=off"])
+            .args(["-append", "console=ttyS0 loglevel=3 panic=-1 mitigations=off"])
             .args(["-serial", &format!("file:{}", console.display())])
             .args(["-device", "virtio-serial-pci,max_ports=16"]);
         for (name, socket) in &sockets {

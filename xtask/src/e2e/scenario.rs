@@ -37,7 +37,7 @@ pub const ALL: &[Scenario] = &[
     ("firmware hangs", hang),
     ("interlock opens", interlock),
     ("clock of the host steps", clock_step),
-    ("depth after all faults", depth::depth),
+    ("depth after all faults", depth::again),
     ("pairs at full size", depth::full_pairs),
     ("depth at full size", depth::full_depth),
 ];

@@ -31,6 +31,10 @@ pub struct Transfers {
     replies: Vec<u8>,
     /// Pipes whose foremost transfer was given up; the device has not been told.
     unlinked: Vec<Pipe>,
+    /// Sequence number of the newest transfer.
+    newest: u32,
+    /// Transfers that were given up before they were asked for.
+    given_up: Vec<u32>,
 }
 
 impl Transfers {
@@ -41,7 +45,11 @@ impl Transfers {
                 // No simulated device has such an endpoint.
                 self.replies.extend(wire::submit_reply(submit.sequence, EINVAL, 0, &[]));
             }
+            Command::Submit(submit) if self.given_up.contains(&submit.sequence) => {
+                self.given_up.retain(|sequence| *sequence != submit.sequence);
+            }
             Command::Submit(submit) => {
+                self.newest = submit.sequence;
                 let key = (submit.endpoint, submit.endpoint != 0 && submit.is_in);
                 match self.waiting.iter_mut().find(|(k, _)| *k == key) {
                     Some((_, queue)) => queue.push_back(submit),
@@ -59,6 +67,12 @@ impl Transfers {
                     if at == 0 {
                         self.unlinked.push(*pipe);
                     }
+                }
+                // Linux' vhci-hcd sends what it wants to give up before what it wants, where one comes
+                // right after the other. An answer to such a transfer would end the connection.
+                if status == 0 && victim.wrapping_sub(self.newest) as i32 > 0 {
+                    self.given_up.push(victim);
+                    status = ECONNRESET;
                 }
                 self.replies.extend(wire::unlink_reply(sequence, status));
             }

@@ -1,15 +1,18 @@
 //! The sensor that is plugged in: control interface, cameras, calibration.
 
+use std::path::Path;
+
 use stspp::camera::CameraError;
 use stspp::camera::live::CameraPlan;
 use stspp::camera::v4l2::node::{Node, NodeKind};
 use stspp::camera::v4l2::pixels::PixelFormat;
 use stspp::camera::v4l2::topology::{SensorCameras, UsbCamera};
 use stspp::sensor::open::{LiveOptions, calibration_files};
+use stspp::transport::serial;
 use stspp::{Error, Sensor, SourceUri};
 use stspp_protocol::version::PROTOCOL_VERSION;
 
-use super::Check;
+use super::{Check, Verdict};
 
 /// Part of a high-speed or faster bus that pictures can take (USB 2.0, 5.8.4: 13 of 15 microframe
 /// packets is the theory, hubs and hosts take more).
@@ -23,9 +26,7 @@ pub fn checks(uri: &SourceUri) -> Vec<Check> {
     let mut checks = Vec::new();
     let (usb_path, options) = match uri {
         SourceUri::Usb { serial, options } => (plugged(serial.as_deref(), &mut checks), options),
-        SourceUri::Serial { path, options } => {
-            (path.as_deref().and_then(stspp::transport::serial::usb_path), options)
-        }
+        SourceUri::Serial { path, options } => (port(path.as_deref(), &mut checks), options),
         _ => return checks,
     };
     let options = match LiveOptions::parse("usb", options) {
@@ -35,7 +36,7 @@ pub fn checks(uri: &SourceUri) -> Vec<Check> {
             return checks;
         }
     };
-    let resolution_px = control(uri, &mut checks);
+    let (sensor, resolution_px) = control(uri, &mut checks);
     let plan = CameraPlan {
         choice: options.choice(),
         control_usb_path: usb_path,
@@ -44,7 +45,65 @@ pub fn checks(uri: &SourceUri) -> Vec<Check> {
         gain: options.gain,
     };
     cameras(&plan, &mut checks);
+    if let Some(sensor) = sensor.filter(|_| checks.iter().all(|c| c.verdict != Verdict::Bad)) {
+        checks.push(cameras_start(&sensor));
+    }
     checks
+}
+
+/// The serial ports that may have a sensor, and whether they can be opened; the USB device of the one
+/// that is meant.
+fn port(path: Option<&Path>, checks: &mut Vec<Check>) -> Option<String> {
+    const NAME: &str = "serial port";
+    let ports = match path {
+        Some(path) => vec![path.to_owned()],
+        None => serial::ports(),
+    };
+    if ports.is_empty() {
+        let remedy =
+            "plug the USB-UART bridge in; its driver (cp210x, ch341, ftdi_sio) comes with it";
+        checks.push(Check::bad(NAME, "no port of a USB bridge", remedy));
+    }
+    for port in &ports {
+        let shown = port.display();
+        let opened = std::fs::OpenOptions::new().read(true).write(true).open(port);
+        checks.push(match opened {
+            Ok(_) => Check::good(NAME, format!("{shown} can be opened")),
+            Err(error) => {
+                let remedy = match error.kind() {
+                    std::io::ErrorKind::PermissionDenied => {
+                        "join its group and log in again: sudo usermod -aG dialout $USER"
+                    }
+                    std::io::ErrorKind::ResourceBusy => "close the program that uses it",
+                    _ => "plug the USB-UART bridge in; `stspp list --probe-serial` shows the ports",
+                };
+                Check::bad(NAME, format!("{shown}: {error}"), remedy)
+            }
+        });
+    }
+    match ports.as_slice() {
+        [port] => serial::usb_path(port),
+        _ => None,
+    }
+}
+
+/// Starts the cameras for a moment, without light: shows one that another program has, and one that
+/// delivers another size than the calibration's.
+fn cameras_start(sensor: &Sensor) -> Check {
+    const NAME: &str = "cameras start";
+    match sensor.try_start() {
+        Ok(()) => Check::good(NAME, "both, at the calibration's size"),
+        Err(error) => {
+            let remedy = match &error {
+                Error::Camera(CameraError::Busy { .. }) => "close the program that uses it",
+                Error::Camera(CameraError::Size { .. }) => {
+                    "use the calibration of this sensor, or cameras of its model"
+                }
+                _ => "unplug the cameras and plug them in again",
+            };
+            Check::bad(NAME, error.to_string(), remedy)
+        }
+    }
 }
 
 #[cfg(feature = "usb")]
@@ -95,8 +154,8 @@ fn plugged(_serial: Option<&str>, checks: &mut Vec<Check>) -> Option<String> {
     None
 }
 
-/// Handshake, versions, faults, calibration; the calibration's image size.
-fn control(uri: &SourceUri, checks: &mut Vec<Check>) -> Option<[usize; 2]> {
+/// Handshake, versions, faults, calibration; the sensor and the calibration's image size.
+fn control(uri: &SourceUri, checks: &mut Vec<Check>) -> (Option<Sensor>, Option<[usize; 2]>) {
     let sensor = match Sensor::open_uri(uri) {
         Ok(sensor) => sensor,
         Err(error) => {
@@ -107,7 +166,7 @@ fn control(uri: &SourceUri, checks: &mut Vec<Check>) -> Option<[usize; 2]> {
                 _ => "see the message",
             };
             checks.push(Check::bad("handshake", error.to_string(), remedy));
-            return None;
+            return (None, None);
         }
     };
     let info = sensor.info();
@@ -123,7 +182,7 @@ fn control(uri: &SourceUri, checks: &mut Vec<Check>) -> Option<[usize; 2]> {
         ),
     ));
     checks.push(state(&sensor));
-    match sensor.calibration() {
+    let resolution_px = match sensor.calibration() {
         Ok(calibration) => {
             let [width, height] = calibration.left.resolution_px;
             let found =
@@ -138,7 +197,8 @@ fn control(uri: &SourceUri, checks: &mut Vec<Check>) -> Option<[usize; 2]> {
             checks.push(Check::bad("calibration", format!("none for {serial}"), remedy));
             None
         }
-    }
+    };
+    (Some(sensor), resolution_px)
 }
 
 fn state(sensor: &Sensor) -> Check {
