@@ -194,7 +194,7 @@ fn fetch(port: u16, bus_id: &str, frames: u32, expected: &[u8]) {
     for _ in 0..5 {
         host.send(true, 1, BUFFER, [0; 8], &[]);
     }
-    let mut payload = Vec::with_capacity(expected.len() + 12);
+    let mut payload: Vec<u8> = Vec::with_capacity(expected.len() + 12);
     let mut number = 0;
     while number < frames {
         let (_, _, (status, data)) = host.reply();

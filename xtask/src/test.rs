@@ -2,7 +2,7 @@
 //! one failed, so that one run shows all that is wrong.
 
 use crate::stage::{self, Outcome, Stage};
-use crate::{arrows, book, e2e, firmware, kernels, licences, workspace};
+use crate::{arrows, book, firmware, kernels, licences, workspace};
 use std::process::{Command, ExitCode};
 
 /// How much to test.
@@ -74,9 +74,7 @@ pub fn run(depth: Depth) -> ExitCode {
     ];
     let deeper: Vec<Stage> =
         KERNELS.map(|(name, work)| stage::run(name, || full(depth, work))).into();
-    // Last: its programs were built for the tests.
-    let guest = stage::run("sensor on a real kernel", || full(depth, e2e::stage));
-    summarise(&[stages, deeper, vec![guest]].concat())
+    summarise(&[stages, deeper].concat())
 }
 
 /// A stage's name and work.

@@ -21,7 +21,6 @@ mod scenario;
 mod score;
 mod server;
 
-use crate::stage::{self, Outcome};
 use crate::{debian, firmware, workspace};
 use bench::{Bench, DEVICES, SCENE_SCALE, built};
 use std::path::PathBuf;
@@ -53,21 +52,6 @@ struct Tried {
 pub fn run(only: Option<&str>) -> Result<String, String> {
     debian::ensure(PACKAGES)?;
     run_with(&kernel::prepare()?, only)
-}
-
-/// All scenarios as a stage of the test command: skipped only where the machine, the packages or the
-/// firmware for it cannot be had.
-pub fn stage() -> Outcome {
-    if !cfg!(all(target_os = "linux", target_arch = "x86_64")) {
-        return Outcome::Skipped("the guest is a Linux machine of the x86-64 kind".into());
-    }
-    if !firmware::images_are_there() {
-        return Outcome::Skipped("there is no firmware to run: see the stage \"firmware\"".into());
-    }
-    match debian::ensure(PACKAGES).and_then(|()| kernel::prepare()) {
-        Ok(kernel) => stage::check(run_with(&kernel, None)),
-        Err(why) => Outcome::Skipped(why),
-    }
 }
 
 fn run_with(kernel: &kernel::Kernel, only: Option<&str>) -> Result<String, String> {
