@@ -78,9 +78,15 @@ impl Rates {
         });
     }
 
-    /// Whether anything moves.
+    /// Whether anything moves. Among thousands of blocks a few pass the test for noise, each alone; what
+    /// moves shows in the blocks around it, whose planes share its pixels.
     pub fn any(&self) -> bool {
-        self.around.iter().any(|a| a.rate != 0.0)
+        let moves = |(c, r): (usize, usize)| self.around[r * self.columns + c].rate != 0.0;
+        let all = (0..self.rows).flat_map(|r| (0..self.columns).map(move |c| (c, r)));
+        all.filter(|&block| moves(block)).any(|block| {
+            let near = neighbours(block, (self.columns, self.rows), REACH);
+            near.into_iter().filter(|&other| moves(other)).count() >= ALIKE_MIN
+        })
     }
 
     /// Which blocks' pixels may move: those with a rate, and around them.
