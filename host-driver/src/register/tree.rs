@@ -18,8 +18,11 @@ pub(crate) struct PointTree {
 impl PointTree {
     /// `None` without points. They must be finite.
     pub fn new(points_m: &[[f64; 3]]) -> Option<Self> {
+        if points_m.is_empty() {
+            return None;
+        }
         let sum = points_m.iter().fold(Vector3::zeros(), |s, p| s + Vector3::from(*p));
-        let middle = sum / points_m.len().max(1) as f64;
+        let middle = sum / points_m.len() as f64;
         let rounded: Vec<[f32; 3]> = points_m.iter().map(|p| about(&middle, p)).collect();
         let tree = ImmutableKdTree::new_from_slice(&rounded).ok()?;
         Some(Self { tree, middle })

@@ -16,6 +16,8 @@ use crate::RawImage;
 use gray::Gray;
 use refine::Refined;
 
+/// Grey value, of 255, below which the brightest parts of an image are dark.
+const BRIGHT_MIN: u8 = 64;
 /// Grey value, of 255, at which white counts as cut off.
 const SATURATED: f64 = 252.0;
 
@@ -120,14 +122,17 @@ pub fn detect(raw: &RawImage, board: &Board) -> Result<Detection, Problem> {
         Pattern::Circles => circles::detect(&gray, board),
     };
     // In the dark nothing can be said of the board.
-    found.map_err(|problem| match contrast(&gray) {
-        contrast if f64::from(contrast) < CONTRAST_MIN => Problem::Dark { contrast },
-        _ => problem,
+    found.map_err(|problem| {
+        let (dark, bright) = extremes(&gray);
+        let contrast = bright.saturating_sub(dark);
+        // A bright image without contrast shows a wall, not a want of light.
+        let is_dark = f64::from(contrast) < CONTRAST_MIN && bright < BRIGHT_MIN;
+        if is_dark { Problem::Dark { contrast } } else { problem }
     })
 }
 
-/// Grey values between the darkest and the brightest hundredth of an image.
-fn contrast(gray: &Gray) -> u8 {
+/// Grey values, of 255, of the darkest and the brightest hundredth of an image.
+fn extremes(gray: &Gray) -> (u8, u8) {
     let mut counts = [0_usize; 256];
     gray.to_u8().into_iter().for_each(|value| counts[usize::from(value)] += 1);
     let hundredth = gray.pixels.as_slice().len() / 100;
@@ -142,8 +147,7 @@ fn contrast(gray: &Gray) -> u8 {
             })
             .unwrap_or(0)
     };
-    let (dark, bright) = (beyond(|k| k), beyond(|k| 255 - k));
-    bright.saturating_sub(dark) as u8
+    (beyond(|k| k) as u8, beyond(|k| 255 - k) as u8)
 }
 
 #[cfg(test)]
