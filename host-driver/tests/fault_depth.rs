@@ -6,11 +6,11 @@
 mod faults;
 mod live;
 
-use faults::{Bench, Fault, FrameFault, TIMES, accounted, faults, frame_fault};
+use faults::{Bench, FrameFault, Watch, frame_fault, run_all};
 use live::Dice;
 use stspp::accuracy::CanvasTruth;
 use stspp::accuracy::score::score;
-use stspp::{DepthFrame, DepthStream, Error, StreamOptions};
+use stspp::{DepthFrame, DepthStream, Error, Sensor, StreamOptions, StreamStats};
 use stspp_matcher::{Method, ShapeFunction};
 
 /// What an undisturbed stream's frames are like. The RMS of these small frames varies, by a quarter in one
@@ -19,8 +19,6 @@ struct Judge {
     truth: CanvasTruth,
     rms_mm: f64,
     points: usize,
-    frames: u64,
-    wrong: u64,
 }
 
 /// A frame is wrong whose RMS is larger by this than that of undisturbed ones, or which lacks more
@@ -45,7 +43,7 @@ impl Judge {
         let first = stream.next().unwrap().unwrap();
         let mask = &stream.matching().left_mask;
         let truth = CanvasTruth::trace(&bench.world, &first.geometry, mask, 0);
-        let mut judge = Self { truth, rms_mm: 0.0, points: 0, frames: 0, wrong: 0 };
+        let mut judge = Self { truth, rms_mm: 0.0, points: 0 };
         let scores: Vec<_> =
             stream.take(20).map(|frame| score(&frame.unwrap(), &judge.truth)).collect();
         judge.rms_mm = scores.iter().map(|s| s.surface_rms_mm).sum::<f64>() / 20.0;
@@ -59,81 +57,48 @@ impl Judge {
         let lacks = 1.0 - score.points as f64 / self.points as f64;
         score.surface_rms_mm > LARGER * self.rms_mm || lacks > LACKS || score.outliers > 0.005
     }
+}
 
-    fn look(&mut self, frame: &DepthFrame) {
+impl Watch for Judge {
+    type Item = DepthFrame;
+    type Stream = DepthStream;
+    const RESUMED: u64 = 2;
+
+    fn start(&self, sensor: &mut Sensor) -> Result<DepthStream, Error> {
+        sensor.stream_with(&options())
+    }
+
+    fn stats(stream: &DepthStream) -> StreamStats {
+        stream.stats()
+    }
+
+    fn finish(stream: DepthStream) -> StreamStats {
+        stream.finish()
+    }
+
+    fn look(&mut self, frame: &DepthFrame) -> bool {
         let first = frame.labels[0];
         let consecutive = (0..).zip(&frame.labels).all(|(k, label)| {
             let slot = (first.slot + k) % 10;
             label.sequence == first.sequence + u32::from(k)
                 && (label.slot, label.projector_mask) == (slot, 1 << slot)
         });
-        self.frames += 1;
-        self.wrong += u64::from(self.is_wrong(frame) || !consecutive);
+        consecutive && !self.is_wrong(frame)
     }
 
-    /// Takes `count` depth frames; the error that ended the stream before that, if one did.
-    fn take(&mut self, stream: &mut DepthStream, count: u64) -> Option<Error> {
-        for _ in 0..count {
-            match stream.next()? {
-                Ok(frame) => self.look(&frame),
-                Err(error) => return Some(error),
-            }
-        }
-        None
+    fn before(dice: &mut Dice) -> u64 {
+        1 + dice.roll(9)
     }
-}
 
-/// Injects one fault twenty times; how often the stream went on, or ended rightly and came back.
-fn run(fault: &Fault, judge: &mut Judge, seed: u64) -> (u64, u64) {
-    let mut bench = Bench::new();
-    let mut dice = Dice(seed);
-    let (mut injected, mut survived) = (0, 0);
-    let mut stream = bench.sensor.stream_with(&options()).unwrap();
-    while injected < TIMES {
-        let early = judge.take(&mut stream, 1 + dice.roll(9));
-        assert!(early.is_none(), "{}: {}", fault.name, early.unwrap());
-        (fault.inject)(&bench, &mut dice);
-        injected += 1;
-        // What is on its way still comes; then the window fills anew.
-        let error = judge.take(&mut stream, if fault.error.is_some() { 200 } else { 8 });
-        match fault.error {
-            None => {
-                let stats = stream.stats();
-                assert!(error.is_none(), "{}: {}, {stats:?}", fault.name, error.unwrap());
-            }
-            Some(is_right) => {
-                let error = error.unwrap_or_else(|| panic!("{}: nothing noticed", fault.name));
-                assert!(is_right(&error), "{}: {error}", fault.name);
-                let stats = stream.finish();
-                assert!(accounted(&stats), "{}: {stats:?}", fault.name);
-                (fault.mend)(&mut bench);
-                stream = bench
-                    .sensor
-                    .stream_with(&options())
-                    .unwrap_or_else(|error| panic!("{}, started again: {error}", fault.name));
-                let error = judge.take(&mut stream, 2);
-                assert!(error.is_none(), "{}, resumed: {}", fault.name, error.unwrap());
-            }
-        }
-        survived += 1;
+    /// The window fills anew.
+    fn after(_dice: &mut Dice) -> u64 {
+        8
     }
-    let stats = stream.finish();
-    assert!(accounted(&stats), "{}: {stats:?}", fault.name);
-    (injected, survived)
 }
 
 #[test]
 fn no_fault_leads_to_a_wrong_depth_frame() {
-    let mut judge = Judge::new();
-    println!("{:<26} {:>8} {:>8} {:>8} {:>6}", "fault", "injected", "survived", "frames", "wrong");
-    for (number, fault) in faults().iter().enumerate() {
-        let (frames, wrong) = (judge.frames, judge.wrong);
-        let (injected, survived) = run(fault, &mut judge, 100 + number as u64);
-        let (frames, wrong) = (judge.frames - frames, judge.wrong - wrong);
-        println!("{:<26} {injected:>8} {survived:>8} {frames:>8} {wrong:>6}", fault.name);
-        assert_eq!((survived, wrong), (injected, 0), "{}", fault.name);
-        assert!(frames >= TIMES, "{}: {frames} depth frames", fault.name);
-    }
+    run_all(&mut Judge::new(), "frames", 100);
 }
 
 #[test]

@@ -7,91 +7,49 @@
 mod faults;
 mod live;
 
-use faults::{Bench, Fault, SCENE, TIMES, accounted, faults};
+use faults::{SCENE, Watch, accounted, run_all};
 use live::{Dice, Witness};
 use stspp::sync::Side;
-use stspp::{Error, PairStream, Sensor, StreamOptions};
+use stspp::{Error, LabelledPair, PairStream, Sensor, StreamOptions, StreamStats};
 
-/// Pairs that were looked at, and how many of them were under a wrong label.
-struct Judge {
-    witness: Witness,
-    pairs: u64,
-    wrong: u64,
-}
+/// Knows by what a picture shows which projector lit it.
+struct Labels(Witness);
 
-impl Judge {
-    fn look(&mut self, pair: &stspp::LabelledPair) {
+impl Watch for Labels {
+    type Item = LabelledPair;
+    type Stream = PairStream;
+    const RESUMED: u64 = 5;
+
+    fn start(&self, sensor: &mut Sensor) -> Result<PairStream, Error> {
+        sensor.pairs(&StreamOptions::default())
+    }
+
+    fn stats(stream: &PairStream) -> StreamStats {
+        stream.stats()
+    }
+
+    fn finish(stream: PairStream) -> StreamStats {
+        stream.finish()
+    }
+
+    fn look(&mut self, pair: &LabelledPair) -> bool {
         let slot = usize::from(pair.label.slot);
         let shown = [(Side::Left, &pair.left), (Side::Right, &pair.right)];
-        let right = shown.iter().all(|(side, image)| self.witness.projector(*side, image) == slot);
-        self.pairs += 1;
-        self.wrong += u64::from(!right);
+        shown.iter().all(|(side, image)| self.0.projector(*side, image) == slot)
     }
 
-    /// Takes `count` pairs; the error that ended the stream before that, if one did.
-    fn take(&mut self, stream: &mut PairStream, count: u64) -> Option<Error> {
-        for _ in 0..count {
-            match stream.next()? {
-                Ok(pair) => self.look(&pair),
-                Err(error) => return Some(error),
-            }
-        }
-        None
+    fn before(dice: &mut Dice) -> u64 {
+        4 + dice.roll(9)
     }
-}
 
-/// Injects one fault twenty times; how often the stream went on, or ended rightly and came back.
-fn run(fault: &Fault, judge: &mut Judge, seed: u64) -> (u64, u64) {
-    let mut bench = Bench::new();
-    let mut dice = Dice(seed);
-    let (mut injected, mut survived) = (0, 0);
-    let options = StreamOptions::default();
-    let mut stream = bench.sensor.pairs(&options).unwrap();
-    while injected < TIMES {
-        let before = 4 + dice.roll(9);
-        let early = judge.take(&mut stream, before);
-        assert!(early.is_none(), "{}: {}", fault.name, early.unwrap());
-        (fault.inject)(&bench, &mut dice);
-        injected += 1;
-        match fault.error {
-            None => {
-                let error = judge.take(&mut stream, 6 + dice.roll(6));
-                assert!(error.is_none(), "{}: {}", fault.name, error.unwrap());
-                survived += 1;
-            }
-            Some(is_right) => {
-                let error = judge.take(&mut stream, 200);
-                let error = error.unwrap_or_else(|| panic!("{}: nothing noticed", fault.name));
-                assert!(is_right(&error), "{}: {error}", fault.name);
-                let stats = stream.finish();
-                assert!(accounted(&stats), "{}: {stats:?}", fault.name);
-                (fault.mend)(&mut bench);
-                stream = bench
-                    .sensor
-                    .pairs(&options)
-                    .unwrap_or_else(|error| panic!("{}, started again: {error}", fault.name));
-                let error = judge.take(&mut stream, 5);
-                assert!(error.is_none(), "{}, resumed: {}", fault.name, error.unwrap());
-                survived += 1;
-            }
-        }
+    fn after(dice: &mut Dice) -> u64 {
+        6 + dice.roll(6)
     }
-    let stats = stream.finish();
-    assert!(accounted(&stats), "{}: {stats:?}", fault.name);
-    (injected, survived)
 }
 
 #[test]
 fn every_fault_is_survived_without_a_wrong_label() {
-    let mut judge = Judge { witness: Witness::learn(SCENE), pairs: 0, wrong: 0 };
-    println!("{:<26} {:>8} {:>8} {:>8} {:>6}", "fault", "injected", "survived", "pairs", "wrong");
-    for (number, fault) in faults().iter().enumerate() {
-        let (pairs, wrong) = (judge.pairs, judge.wrong);
-        let (injected, survived) = run(fault, &mut judge, 1 + number as u64);
-        let (pairs, wrong) = (judge.pairs - pairs, judge.wrong - wrong);
-        println!("{:<26} {injected:>8} {survived:>8} {pairs:>8} {wrong:>6}", fault.name);
-        assert_eq!((survived, wrong), (injected, 0), "{}", fault.name);
-    }
+    run_all(&mut Labels(Witness::learn(SCENE)), "pairs", 1);
 }
 
 /// Resident memory in MiB.

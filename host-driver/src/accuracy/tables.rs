@@ -7,7 +7,7 @@ use stspp_matcher::{Error as MatchError, Matcher, Method, Params, ShapeFunction}
 use super::score::{central_plane_mm, score, sphere_rms_mm};
 use super::{CanvasTruth, Capture, Score};
 use crate::DepthFrame;
-use crate::reconstruct::RectifiedStack;
+use crate::reconstruct::{Options, RectifiedStack};
 use crate::rectify::{DepthRange, Rectifier, RectifyError};
 
 /// Radius of the sphere in metres.
@@ -45,6 +45,13 @@ pub struct Setting {
     pub threads: Option<usize>,
     /// Whether the dense method settles depth steps by the pixels' own grey values.
     pub settle_steps: bool,
+}
+
+impl From<&Options> for Setting {
+    fn from(options: &Options) -> Self {
+        let Options { method, shape, threads, settle_steps, .. } = *options;
+        Self { method, shape, threads, settle_steps }
+    }
 }
 
 /// A scene, simulated and rectified, with the truth of its canvas.

@@ -307,6 +307,106 @@ pub struct Fault {
     pub error: Option<fn(&Error) -> bool>,
 }
 
+/// A stream that is disturbed, and what looks at what it delivers.
+pub trait Watch {
+    type Item;
+    type Stream: Iterator<Item = Result<Self::Item, Error>>;
+    /// Items that are looked at after a stream was started again.
+    const RESUMED: u64;
+
+    fn start(&self, sensor: &mut Sensor) -> Result<Self::Stream, Error>;
+    fn stats(stream: &Self::Stream) -> StreamStats;
+    fn finish(stream: Self::Stream) -> StreamStats;
+
+    /// Looks at an item; whether it is right.
+    fn look(&mut self, item: &Self::Item) -> bool;
+
+    /// Items before a fault, and after one that the stream survives.
+    fn before(dice: &mut Dice) -> u64;
+    fn after(dice: &mut Dice) -> u64;
+}
+
+/// Items looked at, and how many of them were wrong.
+#[derive(Default)]
+struct Seen {
+    items: u64,
+    wrong: u64,
+}
+
+impl Seen {
+    /// Takes `count` items; the error that ended the stream before that, if one did.
+    fn take<W: Watch>(
+        &mut self,
+        watch: &mut W,
+        stream: &mut W::Stream,
+        count: u64,
+    ) -> Option<Error> {
+        for _ in 0..count {
+            match stream.next()? {
+                Ok(item) => {
+                    self.items += 1;
+                    self.wrong += u64::from(!watch.look(&item));
+                }
+                Err(error) => return Some(error),
+            }
+        }
+        None
+    }
+}
+
+/// Injects one fault [`TIMES`] times; how often the stream went on, or ended rightly and came back.
+fn run<W: Watch>(fault: &Fault, watch: &mut W, seen: &mut Seen, seed: u64) -> (u64, u64) {
+    let mut bench = Bench::new();
+    let mut dice = Dice(seed);
+    let (mut injected, mut survived) = (0, 0);
+    let mut stream = watch.start(&mut bench.sensor).unwrap();
+    while injected < TIMES {
+        let early = seen.take(watch, &mut stream, W::before(&mut dice));
+        assert!(early.is_none(), "{}: {}", fault.name, early.unwrap());
+        (fault.inject)(&bench, &mut dice);
+        injected += 1;
+        // What is on its way still comes.
+        match fault.error {
+            None => {
+                let error = seen.take(watch, &mut stream, W::after(&mut dice));
+                let stats = W::stats(&stream);
+                assert!(error.is_none(), "{}: {}, {stats:?}", fault.name, error.unwrap());
+            }
+            Some(is_right) => {
+                let error = seen.take(watch, &mut stream, 200);
+                let error = error.unwrap_or_else(|| panic!("{}: nothing noticed", fault.name));
+                assert!(is_right(&error), "{}: {error}", fault.name);
+                let stats = W::finish(stream);
+                assert!(accounted(&stats), "{}: {stats:?}", fault.name);
+                (fault.mend)(&mut bench);
+                stream = watch
+                    .start(&mut bench.sensor)
+                    .unwrap_or_else(|error| panic!("{}, started again: {error}", fault.name));
+                let error = seen.take(watch, &mut stream, W::RESUMED);
+                assert!(error.is_none(), "{}, resumed: {}", fault.name, error.unwrap());
+            }
+        }
+        survived += 1;
+    }
+    let stats = W::finish(stream);
+    assert!(accounted(&stats), "{}: {stats:?}", fault.name);
+    (injected, survived)
+}
+
+/// Injects all faults, prints a table, and holds that each was survived and no item wrong. Seeds begin
+/// at `seed`.
+pub fn run_all<W: Watch>(watch: &mut W, items: &str, seed: u64) {
+    println!("{:<26} {:>8} {:>8} {items:>8} {:>6}", "fault", "injected", "survived", "wrong");
+    for (number, fault) in faults().iter().enumerate() {
+        let mut seen = Seen::default();
+        let (injected, survived) = run(fault, watch, &mut seen, seed + number as u64);
+        let Seen { items, wrong } = seen;
+        println!("{:<26} {injected:>8} {survived:>8} {items:>8} {wrong:>6}", fault.name);
+        assert_eq!((survived, wrong), (injected, 0), "{}", fault.name);
+        assert!(items >= TIMES, "{}: {items} looked at", fault.name);
+    }
+}
+
 /// Disturbs the next frame of one of the cameras.
 pub fn frame_fault(bench: &Bench, dice: &mut Dice, fault: FrameFault) {
     let side = dice.roll(2) as usize;

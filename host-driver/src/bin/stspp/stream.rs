@@ -235,9 +235,8 @@ fn show(
     let mut frames = 0;
     let result = follow(&mut stream, count, &mut frames, output, &live);
     live.finish_and_clear();
-    let stats = stream.stats();
-    // The light is off before anything else is said.
-    drop(stream);
+    // The light is off before anything else is said, and frames that were on their way are counted.
+    let stats = stream.finish();
     summary(&stats, begun.elapsed().as_secs_f64(), output);
     *shown += frames;
     result?;

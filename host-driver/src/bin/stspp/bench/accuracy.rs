@@ -50,12 +50,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         scenes => scenes.iter().any(|s| s == scene),
     };
     let options = args.matching.options();
-    let setting = Setting {
-        method: options.method,
-        shape: options.shape,
-        threads: options.threads,
-        settle_steps: options.settle_steps,
-    };
+    let setting = Setting::from(&options);
     let frames = args.matching.frames.unwrap_or(10);
     let spinner = output.spinner();
     let mut lines: Vec<Line> = Vec::new();

@@ -26,12 +26,7 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let options = args.matching.options();
-    let setting = Setting {
-        method: options.method,
-        shape: options.shape,
-        threads: options.threads,
-        settle_steps: false,
-    };
+    let setting = Setting::from(&options);
     let frames = args.matching.frames.unwrap_or(10);
     let spinner = output.spinner();
     let mut lines: Vec<Resampled> = Vec::new();
