@@ -323,6 +323,7 @@ impl MatchThread {
                 self.progress.count(|s| s.dropped_depth += 1);
             }
         }
+        self.progress.count(|s| s.dropped_depth += u64::from(item.is_ok()));
         false
     }
 }

@@ -88,7 +88,7 @@ pub struct StreamStats {
     pub window_gaps: u64,
     /// Complete windows.
     pub windows: u64,
-    /// Depth frames.
+    /// Depth frames made.
     pub depth_frames: u64,
     /// Frames dropped because pairing was too slow.
     pub dropped_capture: u64,
@@ -104,7 +104,7 @@ pub struct StreamStats {
     pub reduced_frames: u64,
     /// Wall time of the newest match in milliseconds.
     pub match_ms: f64,
-    /// Depth frames dropped because the user did not fetch them.
+    /// Those of them that the user did not fetch: in time, or at all.
     pub dropped_depth: u64,
     /// Depth frames per second of wall time, over the last ones.
     pub fps: f64,

@@ -180,10 +180,14 @@ impl DepthStream {
         self.threads.stop.clone()
     }
 
-    /// Stops the stream, waits for its threads and returns the final counters.
+    /// Stops the stream, waits for its threads and returns the final counters. Frames that were not
+    /// fetched are counted as such.
     pub fn finish(self) -> StreamStats {
-        drop(self.results);
-        self.threads.finish()
+        let Self { results, mut threads, .. } = self;
+        threads.end();
+        let left = results.try_iter().filter(Result::is_ok).count() as u64;
+        threads.progress.count(|s| s.dropped_depth += left);
+        threads.stats()
     }
 
     /// How this stream matches.

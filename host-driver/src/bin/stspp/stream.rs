@@ -329,7 +329,7 @@ fn summary(stats: &StreamStats, wall_s: f64, output: &Output) {
          dropped   {} frames, {} pairs, {} windows skipped, {} depth frames not fetched\n\
          budget    {} matches took longer than the camera's period, {} were made at first order; one \
          window of {} is matched",
-        stats.depth_frames,
+        stats.depth_frames - stats.dropped_depth,
         stats.fps,
         stats.latency_ms,
         stats.triggers,
