@@ -13,8 +13,12 @@ use crate::{
         order::{OrderChoice, accept},
         settle::Settle,
     },
+    lanes::vectorised,
     regions::Regions,
 };
+
+/// Rows of a task.
+const BAND: usize = 32;
 
 /// Buffers and stages of [`crate::Method::Dense`], kept between frames.
 #[derive(Debug)]
@@ -31,13 +35,14 @@ pub(crate) struct Fast {
     maps: DenseMaps,
     order: OrderChoice,
     regions: Regions,
+    trial: pace::Trial,
 }
 
 impl Fast {
     pub(crate) fn new(level: Level, params: &Params) -> Self {
         let a = &params.advanced;
         Self {
-            level,
+            level: level.usable(),
             params: params.clone(),
             coarse: Coarse::new(level, params.disparity),
             map: CoarseMap::new(0, 0),
@@ -48,7 +53,8 @@ impl Fast {
             motion: MotionFit::new(level),
             maps: DenseMaps::new(0, 0),
             order: OrderChoice::default(),
-            regions: Regions::default(),
+            regions: Regions::new(level),
+            trial: pace::Trial::new(level, params.disparity),
         }
     }
 
@@ -73,16 +79,16 @@ impl Fast {
         let mut frames = all;
         loop {
             let part = pace::newest(stack, frames);
-            let rate = self.once(&part, out, &mut done);
+            self.once(&part, out, &mut done);
+            let rate = self.motion.found();
             if !self.params.motion || !in_order || all <= FRAMES_MIN {
                 return;
             }
             let last = frames <= FRAMES_MIN;
             let fewer = if last { FRAMES_MIN - 1 } else { frames.div_ceil(2).max(FRAMES_MIN) };
-            let found = (&out.disparity_px, rate.as_ref());
-            let (level, range) = (self.level, self.params.disparity);
+            let found = (&out.disparity_px, rate);
             let too_fast = pace::travels(&part, found)
-                || pace::loses(level, range, &part, &pace::newest(stack, fewer), found);
+                || self.trial.loses(&part, &pace::newest(stack, fewer), found);
             if !too_fast {
                 return;
             }
@@ -98,13 +104,13 @@ impl Fast {
         }
     }
 
-    /// One match of a stack; gives the rate.
+    /// One match of a stack.
     fn once(
         &mut self,
         stack: &StereoStack<'_>,
         out: &mut Matched,
         mut done: impl FnMut(&'static str),
-    ) -> Option<Image<f32>> {
+    ) {
         let (width, height) = (stack.width(), stack.height());
         if (self.start.width(), self.start.height()) != (width, height) {
             self.start = Image::new(width, height, f32::NAN);
@@ -113,7 +119,7 @@ impl Fast {
         done("describe");
         self.coarse.search(stack, true, &mut self.map);
         done("search");
-        begin(stack, &self.map, &mut self.start);
+        begin(self.level, stack, &self.map, &mut self.start);
         self.regions.remove(&mut self.start, self.params.advanced.region_min);
         let settles = self.params.advanced.settle_steps;
         if settles {
@@ -134,14 +140,11 @@ impl Fast {
             settle.run(stack, self.params.zncc_min, fit, start, step, maps);
             done("settle");
         }
-        let rate = if self.params.motion {
-            let rate =
-                self.motion.run(stack, &mut self.fit, &self.start, &self.step, &mut self.maps);
+        if self.params.motion {
+            self.motion.run(stack, &mut self.fit, &self.start, &self.step, &mut self.maps);
             done("motion");
-            rate
-        } else {
-            None
-        };
+        }
+        let rate = self.motion.found();
         for map in [&mut out.disparity_px, &mut out.zncc] {
             fit_size(map, width, height);
         }
@@ -157,16 +160,15 @@ impl Fast {
         }
         done("order");
         self.regions.remove(disparity, self.params.advanced.region_min);
-        invalid_together(disparity, Some(&self.maps.zncc), &mut out.zncc);
+        invalid_together(self.level, disparity, Some(&self.maps.zncc), &mut out.zncc);
         if self.params.motion && stack.times_s.is_some() {
             let rates = out.rate_px_per_s.get_or_insert_with(|| Image::new(0, 0, 0.0));
             fit_size(rates, width, height);
-            invalid_together(disparity, rate.as_ref(), rates);
+            invalid_together(self.level, disparity, rate, rates);
         } else {
             out.rate_px_per_s = None;
         }
         done("regions");
-        rate
     }
 }
 
@@ -177,41 +179,64 @@ fn fit_size(map: &mut Image<f32>, width: usize, height: usize) {
 }
 
 /// Copies `from`, or zeros, to where the disparity is valid, and NaN elsewhere.
-fn invalid_together(disparity: &Image<f32>, from: Option<&Image<f32>>, to: &mut Image<f32>) {
-    let width = to.width().max(1);
-    let bands = to.as_mut_slice().par_chunks_mut(64 * width);
-    bands.zip(disparity.as_slice().par_chunks(64 * width)).enumerate().for_each(
-        |(band, (to, disparity))| match from {
-            Some(from) => {
-                let from = &from.as_slice()[band * 64 * width..];
-                for ((to, v), d) in to.iter_mut().zip(from).zip(disparity) {
-                    *to = if d.is_nan() { f32::NAN } else { *v };
-                }
-            }
-            None => {
-                for (to, d) in to.iter_mut().zip(disparity) {
-                    *to = if d.is_nan() { f32::NAN } else { 0.0 };
-                }
-            }
+fn invalid_together(
+    level: Level,
+    disparity: &Image<f32>,
+    from: Option<&Image<f32>>,
+    to: &mut Image<f32>,
+) {
+    let band = BAND * to.width().max(1);
+    let bands = to.as_mut_slice().par_chunks_mut(band);
+    bands.zip(disparity.as_slice().par_chunks(band)).enumerate().for_each(
+        |(k, (to, disparity))| {
+            vectorised!(
+                level,
+                together_loop(
+                    disparity: &[f32] = disparity,
+                    from: Option<&[f32]> = from.map(|from| &from.as_slice()[k * band..]),
+                    to: &mut [f32] = to,
+                )
+            );
         },
     );
 }
 
-/// The coarse map as the fit's start, without what the masks exclude.
-fn begin(stack: &StereoStack<'_>, map: &CoarseMap, start: &mut Image<f32>) {
-    let width = stack.width();
-    start.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, start)| {
-        let row = map.disparity.row(y);
-        for (to, &d) in start.iter_mut().zip(row) {
-            *to = if d == INVALID { f32::NAN } else { f32::from(d) };
-        }
-        if let Some(mask) = stack.left_mask {
-            for (to, &seen) in start.iter_mut().zip(mask.row(y)) {
-                *to = if seen == 0 { f32::NAN } else { *to };
+#[inline(always)]
+fn together_loop(disparity: &[f32], from: Option<&[f32]>, to: &mut [f32]) {
+    match from {
+        Some(from) => {
+            for ((to, v), d) in to.iter_mut().zip(from).zip(disparity) {
+                *to = if d.is_nan() { f32::NAN } else { *v };
             }
         }
-        if let Some(mask) = stack.right_mask {
-            let mask = mask.row(y);
+        None => {
+            for (to, d) in to.iter_mut().zip(disparity) {
+                *to = if d.is_nan() { f32::NAN } else { 0.0 };
+            }
+        }
+    }
+}
+
+/// The coarse map as the fit's start, without what the masks exclude.
+fn begin(level: Level, stack: &StereoStack<'_>, map: &CoarseMap, start: &mut Image<f32>) {
+    let width = stack.width();
+    start.as_mut_slice().par_chunks_mut(width * BAND).enumerate().for_each(|(band, rows)| {
+        for (k, start) in rows.chunks_mut(width).enumerate() {
+            let y = band * BAND + k;
+            let right = stack.right_mask.map(|mask| mask.row(y));
+            // A camera's part of a row is almost always in one piece.
+            let (from, to) = right.map_or((0, width), ends);
+            let pieces = right.filter(|mask| mask[from..to].contains(&0));
+            vectorised!(
+                level,
+                begin_loop(
+                    row: &[i16] = map.disparity.row(y),
+                    left: Option<&[u8]> = stack.left_mask.map(|mask| mask.row(y)),
+                    seen: (i32, i32) = (from as i32, to as i32),
+                    start: &mut [f32] = start,
+                )
+            );
+            let Some(mask) = pieces else { continue };
             for (x, to) in start.iter_mut().enumerate().filter(|(_, to)| !to.is_nan()) {
                 // The search gives only disparities with a counterpart inside the image.
                 let seen = mask.get((x as f32 - *to) as usize).copied().unwrap_or(0);
@@ -219,4 +244,26 @@ fn begin(stack: &StereoStack<'_>, map: &CoarseMap, start: &mut Image<f32>) {
             }
         }
     });
+}
+
+/// The first non-zero place of a mask, and the one after the last.
+fn ends(mask: &[u8]) -> (usize, usize) {
+    let from = mask.iter().position(|seen| *seen != 0).unwrap_or(0);
+    let to = mask.iter().rposition(|seen| *seen != 0).map_or(from, |last| last + 1);
+    (from, to)
+}
+
+/// Disparities with a counterpart in the columns `from..to` of the right row, where `left` is set.
+#[inline(always)]
+fn begin_loop(row: &[i16], left: Option<&[u8]>, (from, to): (i32, i32), start: &mut [f32]) {
+    for (x, (start, &d)) in (0i32..).zip(start.iter_mut().zip(row)) {
+        let at = x - i32::from(d);
+        let seen = (d != INVALID) & (at >= from) & (at < to);
+        *start = if seen { f32::from(d) } else { f32::NAN };
+    }
+    if let Some(left) = left {
+        for (start, &seen) in start.iter_mut().zip(left) {
+            *start = if seen == 0 { f32::NAN } else { *start };
+        }
+    }
 }

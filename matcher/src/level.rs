@@ -15,9 +15,9 @@ pub enum Level {
     Scalar,
     /// AArch64 NEON, 128 bits.
     Neon,
-    /// x86-64 AVX2 with FMA, 256 bits.
+    /// x86-64 AVX2 with FMA and POPCNT, 256 bits.
     Avx2,
-    /// x86-64 AVX-512 F, BW, VL, DQ with VPOPCNTDQ, BITALG, VNNI, VBMI and GFNI (Ice Lake, Zen 4
+    /// x86-64 AVX-512 F, BW, VL, DQ with VPOPCNTDQ, BITALG, VNNI, VBMI, VBMI2 and GFNI (Ice Lake, Zen 4
     /// and later), 512 bits.
     Avx512,
 }
@@ -83,7 +83,11 @@ impl Level {
             #[cfg(target_arch = "aarch64")]
             Level::Neon => std::arch::is_aarch64_feature_detected!("neon"),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+            Level::Avx2 => {
+                is_x86_feature_detected!("avx2")
+                    && is_x86_feature_detected!("fma")
+                    && is_x86_feature_detected!("popcnt")
+            }
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => {
                 Level::Avx2.runs_here()
@@ -95,6 +99,7 @@ impl Level {
                     && is_x86_feature_detected!("avx512bitalg")
                     && is_x86_feature_detected!("avx512vnni")
                     && is_x86_feature_detected!("avx512vbmi")
+                    && is_x86_feature_detected!("avx512vbmi2")
                     && is_x86_feature_detected!("gfni")
             }
             #[allow(unreachable_patterns)]

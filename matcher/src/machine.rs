@@ -5,7 +5,7 @@ use std::{hint::black_box, time::Instant};
 
 use crate::{
     Level,
-    coarse::hamming::{BLOCK, best_candidates},
+    coarse::hamming::{BLOCK, Shifts, best_candidates},
     lanes::{Lanes, dispatch},
 };
 
@@ -44,7 +44,8 @@ fn popcount(level: Level) -> f64 {
     let word = |i: usize| (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
     let left: Vec<u64> = (0..PIXELS).map(word).collect();
     let right: Vec<u64> = (0..PIXELS + CANDIDATES).map(|i| word(i + 7)).collect();
-    let shifts: Vec<i32> = (0..CANDIDATES as i32).collect();
+    let mut shifts = Shifts::default();
+    shifts.extend(0..CANDIDATES as i32);
     let mut best = vec![0; PIXELS];
     fastest((PIXELS * CANDIDATES) as f64, || {
         best_candidates(level, black_box(&left), &right, CANDIDATES, &shifts, &mut best);

@@ -6,7 +6,9 @@
 //! pixel to pixel, but its slope changes little: that joins pixels too. (By a step alone each row of a
 //! sphere's polar caps would be a region of its own.)
 
-use crate::Image;
+use rayon::prelude::*;
+
+use crate::{Image, Level, lanes::vectorised};
 
 /// Neighbours that differ by less are on one surface.
 pub const STEP_PX: f32 = 1.5;
@@ -21,13 +23,26 @@ pub const BEND_PX: f32 = 1.0;
 pub(crate) fn joined(before: f32, a: f32, b: f32, after: f32) -> bool {
     let difference = b - a;
     let bend = |other: f32| (difference - other).abs() <= BEND_PX;
-    difference.abs() <= STEP_PX
-        || (difference.abs() <= STEEP_PX && (bend(a - before) || bend(after - b)))
+    // Without branches, for vectors.
+    let continues = bend(a - before) | bend(after - b);
+    (difference.abs() <= STEP_PX) | ((difference.abs() <= STEEP_PX) & continues)
 }
 
+/// What a pixel is in its row: the first of a run, joined with the pixel before, or none.
+const FIRST: u8 = 0;
+const JOINED: u8 = 1;
+const NONE: u8 = 2;
+/// Pixels that are passed over together within a run.
+const BLOCK: usize = 32;
+/// Rows of a task.
+const BAND: usize = 64;
+
 /// Finds regions; keeps its buffers between frames.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Regions {
+    level: Level,
+    /// What each pixel is in its row.
+    flags: Vec<u8>,
     runs: Vec<Run>,
     /// First run of each row, and the end.
     rows: Vec<u32>,
@@ -41,15 +56,34 @@ struct Run {
     size: u32,
 }
 
+impl Default for Regions {
+    fn default() -> Self {
+        Self::new(Level::best())
+    }
+}
+
 impl Regions {
+    /// Without memory yet.
+    pub fn new(level: Level) -> Self {
+        Self { level: level.usable(), flags: Vec::new(), runs: Vec::new(), rows: Vec::new() }
+    }
+
     /// Sets regions of fewer than `least` pixels to NaN.
     pub fn remove(&mut self, map: &mut Image<f32>, least: usize) {
-        let height = map.height();
+        let (width, height) = (map.width(), map.height());
         self.runs.clear();
         self.rows.clear();
+        self.flags.resize(width * height, NONE);
+        let level = self.level;
+        let bands = self.flags.par_chunks_mut((width * BAND).max(1)).enumerate();
+        bands.for_each(|(band, flags)| {
+            for (k, flags) in flags.chunks_mut(width).enumerate() {
+                flag_row(level, map.row(band * BAND + k), flags);
+            }
+        });
         for y in 0..height {
             self.rows.push(self.runs.len() as u32);
-            self.cut(map.row(y));
+            cut(&self.flags[y * width..][..width], &mut self.runs);
             if y > 0 {
                 self.join(map, y);
             }
@@ -69,27 +103,6 @@ impl Regions {
                     map.row_mut(y)[from as usize..to as usize].fill(f32::NAN);
                 }
             }
-        }
-    }
-
-    /// Cuts a row into runs.
-    fn cut(&mut self, row: &[f32]) {
-        let mut from = 0;
-        while from < row.len() {
-            if row[from].is_nan() {
-                from += 1;
-                continue;
-            }
-            let mut to = from + 1;
-            let at = |x: usize| row.get(x).copied().unwrap_or(f32::NAN);
-            // NaN ends a run, as no comparison with it holds.
-            while to < row.len() && joined(at(to.wrapping_sub(2)), row[to - 1], row[to], at(to + 1))
-            {
-                to += 1;
-            }
-            let (parent, size) = (self.runs.len() as u32, (to - from) as u32);
-            self.runs.push(Run { from: from as u32, to: to as u32, parent, size });
-            from = to;
         }
     }
 
@@ -132,9 +145,69 @@ impl Regions {
     }
 }
 
+/// Tells what each pixel of a row is.
+fn flag_row(level: Level, row: &[f32], flags: &mut [u8]) {
+    let n = row.len();
+    let at = |x: usize| row.get(x).copied().unwrap_or(f32::NAN);
+    let flag = |x: usize| {
+        let before = |k: usize| x.checked_sub(k).map_or(f32::NAN, at);
+        flag(before(2), before(1), at(x), at(x + 1))
+    };
+    if n > 3 {
+        vectorised!(level, flag_loop(row: &[f32] = row, flags: &mut [u8] = &mut flags[2..n - 1]));
+    }
+    for x in (0..n.min(2)).chain(n.saturating_sub(1).max(2)..n) {
+        flags[x] = flag(x);
+    }
+}
+
+/// Flags of the pixels that have two before and one after them.
+#[inline(always)]
+fn flag_loop(row: &[f32], flags: &mut [u8]) {
+    let n = flags.len();
+    let (before, a, b, after) = (&row[..n], &row[1..n + 1], &row[2..n + 2], &row[3..n + 3]);
+    for i in 0..n {
+        flags[i] = flag(before[i], a[i], b[i], after[i]);
+    }
+}
+
+/// What the pixel of value `b` is, after one of value `a`.
+#[inline(always)]
+fn flag(before: f32, a: f32, b: f32, after: f32) -> u8 {
+    let known = if joined(before, a, b, after) { JOINED } else { FIRST };
+    if b.is_nan() { NONE } else { known }
+}
+
+/// Adds a row's runs.
+fn cut(flags: &[u8], runs: &mut Vec<Run>) {
+    let mut from = 0;
+    while from < flags.len() {
+        if flags[from] == NONE {
+            from = end_of(flags, from, NONE);
+            continue;
+        }
+        let to = end_of(flags, from + 1, JOINED);
+        let (parent, size) = (runs.len() as u32, (to - from) as u32);
+        runs.push(Run { from: from as u32, to: to as u32, parent, size });
+        from = to;
+    }
+}
+
+/// The first place from `at` that is not `flag`.
+fn end_of(flags: &[u8], mut at: usize, flag: u8) -> usize {
+    while let Some(block) = flags[at..].first_chunk::<BLOCK>() {
+        if block.iter().fold(0, |other, f| other | (f ^ flag)) != 0 {
+            break;
+        }
+        at += BLOCK;
+    }
+    at + flags[at..].iter().take_while(|f| **f == flag).count()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::synthetic::Random;
 
     #[test]
     fn small_regions_go_and_large_ones_stay() {
@@ -154,6 +227,39 @@ mod tests {
         let mut kept = map.clone();
         Regions::default().remove(&mut kept, 8);
         assert_eq!(kept.row(4)[15], 9.0);
+    }
+
+    /// The rule, pixel by pixel.
+    #[test]
+    fn runs_are_cut_where_the_rule_says_at_every_level() {
+        let mut random = Random::new(8);
+        for n in [1usize, 2, 3, 4, 5, 31, 33, 34, 100, 331] {
+            let row: Vec<f32> = (0..n)
+                .map(|i| match random.bits() % 40 {
+                    0 => f32::NAN,
+                    1 => 50.0,
+                    k => 0.1 * k as f32 + (i / 60) as f32 * 2.9,
+                })
+                .collect();
+            let at = |x: usize| row.get(x).copied().unwrap_or(f32::NAN);
+            let mut want: Vec<(u32, u32)> = Vec::new();
+            for x in 0..n {
+                let before = if x > 1 { at(x - 2) } else { f32::NAN };
+                let joins = x > 0 && joined(before, at(x - 1), at(x), at(x + 1));
+                match want.last_mut() {
+                    Some(last) if joins => last.1 = x as u32 + 1,
+                    _ if at(x).is_nan() => {}
+                    _ => want.push((x as u32, x as u32 + 1)),
+                }
+            }
+            for level in Level::available() {
+                let (mut flags, mut runs) = (vec![9; n], Vec::new());
+                flag_row(level, &row, &mut flags);
+                cut(&flags, &mut runs);
+                let got: Vec<(u32, u32)> = runs.iter().map(|r| (r.from, r.to)).collect();
+                assert_eq!(got, want, "{level} {n}");
+            }
+        }
     }
 
     #[test]

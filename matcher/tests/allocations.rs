@@ -88,6 +88,53 @@ fn no_memory_is_taken_after_the_first_frame() {
     }
 }
 
+/// A scene of which much is lit and not found, so that fewer frames are tried: rows whose right images
+/// belong to another scene.
+#[test]
+fn no_memory_is_taken_where_much_is_lost_either() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let frames = 10;
+    // 200 rows: the last band of those that are tried is not whole.
+    let scene = Scene::benchmark(480, 200, frames, 20.0).render();
+    let mut other = Scene::benchmark(480, 200, frames, 20.0);
+    other.seed += 1;
+    let other = other.render();
+    let times: Vec<f64> = (0..frames).map(|k| k as f64 / 30.0).collect();
+    for lost in [40..110, 110..200] {
+        let right: Vec<Image<Sample>> = scene
+            .right
+            .iter()
+            .zip(&other.right)
+            .map(|(own, other)| {
+                let mut image = own.clone();
+                lost.clone().for_each(|y| image.row_mut(y).copy_from_slice(other.row(y)));
+                image
+            })
+            .collect();
+        let (left, right): (Vec<_>, Vec<_>) = (scene.left.iter().collect(), right.iter().collect());
+        let stack = StereoStack { times_s: Some(&times), ..StereoStack::new(&left, &right) };
+        let mut params = Params::new(DisparityRange { min_px: -150, max_px: 80 });
+        (params.method, params.shape) = (Method::Dense, ShapeFunction::First);
+        params.advanced.threads = Some(1);
+        let mut matcher = Matcher::new(params).unwrap();
+        let mut out = Matched::default();
+        for frame in 0..4 {
+            let taken = TAKEN.load(Relaxed);
+            matcher.match_into(&stack, &mut out).unwrap();
+            let taken = TAKEN.load(Relaxed) - taken;
+            println!("{lost:?} lost, frame {frame}: {taken} bytes");
+            assert!(frame < 2 || taken <= QUEUES, "frame {frame}: {taken} bytes");
+        }
+        let valid = |rows: std::ops::Range<usize>| -> usize {
+            let row = |y| out.disparity_px.row(y).iter().filter(|d| !d.is_nan()).count();
+            rows.map(row).sum()
+        };
+        let found = valid(0..200) as f64 / (200.0 * 480.0);
+        println!("{lost:?} lost: {found} found, {} in the first rows", valid(0..30));
+        assert!(found < 0.8 && (lost.start > 40 || valid(0..30) > 8_000));
+    }
+}
+
 /// Images of the sensor's size and ten frames: what the matcher holds, and with the window's images.
 #[test]
 fn a_full_frame_stays_below_the_limit() {

@@ -59,15 +59,16 @@ pub(crate) fn replace_outliers(
                             suspect: &mut [u8] = suspect,
                         )
                     );
-                    for (block, suspects) in suspect.chunks(BLOCK).enumerate() {
-                        if suspects.iter().fold(0, |any, s| any | s) == 0 {
-                            continue;
-                        }
-                        for (x, _) in (block * BLOCK..).zip(suspects).filter(|(_, s)| **s != 0) {
-                            let bits = |d: i32| distance(left, right, x, y, d);
-                            settle(median[x], bits, &mut disparity[x], &mut cost[x]);
-                        }
-                    }
+                    vectorised!(
+                        level,
+                        settle_loop(
+                            rows: (&[u64], &[u64]) = (left.row(y), right.row(y)),
+                            median: &[i16] = median,
+                            suspect: &[u8] = suspect,
+                            disparity: &mut [i16] = disparity,
+                            cost: &mut [u8] = cost,
+                        )
+                    );
                 }
             });
         },
@@ -83,15 +84,37 @@ fn suspect_loop(median: &[i16], disparity: &[i16], cost: &[u8], suspect: &mut [u
     }
 }
 
+/// Decides between the suspects' own disparities and their neighbours' median.
+#[inline(always)]
+fn settle_loop(
+    (left, right): (&[u64], &[u64]),
+    median: &[i16],
+    suspect: &[u8],
+    disparity: &mut [i16],
+    cost: &mut [u8],
+) {
+    let width = median.len();
+    let (left, right) = (&left[MARGIN..][..width], &right[MARGIN..][..width]);
+    for (block, suspects) in suspect.chunks(BLOCK).enumerate() {
+        if suspects.iter().fold(0, |any, s| any | s) == 0 {
+            continue;
+        }
+        for (x, _) in (block * BLOCK..).zip(suspects).filter(|(_, s)| **s != 0) {
+            let bits = |d: i32| {
+                let at = usize::try_from(x as i32 - d).ok()?;
+                Some((left[x] ^ right.get(at)?).count_ones())
+            };
+            settle(median[x], bits, &mut disparity[x], &mut cost[x]);
+        }
+    }
+}
+
 /// Decides between a pixel's own disparity and its neighbours' `median`.
+#[inline(always)]
 fn settle(median: i16, bits: impl Fn(i32) -> Option<u32>, disparity: &mut i16, cost: &mut u8) {
-    let around = (median != INVALID)
-        .then(|| {
-            (-1..=1)
-                .filter_map(|o| Some((bits(i32::from(median) + o)?, i32::from(median) + o)))
-                .min()
-        })
-        .flatten();
+    let middle = i32::from(median);
+    let near = (-1..=1).filter_map(|o| Some((bits(middle + o)?, middle + o)));
+    let around = if median == INVALID { None } else { near.min() };
     let own = if *disparity == INVALID { u32::MAX } else { u32::from(*cost) };
     match around {
         Some((bits, d)) if bits <= own.saturating_add(THIN_BITS) => {
@@ -105,13 +128,6 @@ fn settle(median: i16, bits: impl Fn(i32) -> Option<u32>, disparity: &mut i16, c
         *disparity = INVALID;
         *cost = u8::MAX;
     }
-}
-
-fn distance(left: &Descriptors, right: &Descriptors, x: usize, y: usize, d: i32) -> Option<u32> {
-    let at = x as i64 - i64::from(d);
-    (0..left.width() as i64)
-        .contains(&at)
-        .then(|| (left.row(y)[MARGIN + x] ^ right.row(y)[MARGIN + at as usize]).count_ones())
 }
 
 fn medians(level: Level, map: &Image<i16>, y: usize, height: usize, out: &mut [i16]) {

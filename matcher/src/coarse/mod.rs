@@ -87,6 +87,8 @@ impl Coarse {
             left: &self.left,
             right: &self.right,
             images: stack.left,
+            left_mask: stack.left_mask,
+            right_mask: stack.right_mask,
         };
         if !clean {
             self.search.run(&scene, map);

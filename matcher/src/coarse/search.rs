@@ -6,9 +6,9 @@ use rayon::prelude::*;
 use super::{
     CoarseMap, INVALID,
     descriptor::{Descriptors, MARGIN},
-    hamming::{BLOCK, best_candidates},
+    hamming::{BLOCK, Shifts, best_candidates, nearest},
 };
-use crate::{DisparityRange, Image, Level, Sample, parallel::PerThread};
+use crate::{DisparityRange, Image, Level, Sample, lanes::vectorised, parallel::PerThread};
 
 /// Rows between seed rows, and rows of a block.
 pub(crate) const SEED_ROWS: usize = 16;
@@ -20,6 +20,8 @@ pub(crate) const UNSURE_COST: u32 = 15;
 /// a thin object, in no more than that.
 const FOUND_COST: u32 = 11;
 const FOUND_COST_FEW: u32 = 13;
+/// A right pixel whose match differs in no more bits is that match's, and no unsure pixel's.
+const TAKEN_COST: u8 = 11;
 /// Fewest frames that are not few.
 const FRAMES_MANY: usize = 6;
 /// Samples over time and the four neighbours span less where no dot is: 3 grey levels.
@@ -81,11 +83,26 @@ struct Scratch {
     even: Vec<u64>,
     odd: Vec<u64>,
     left: Vec<u64>,
-    shifts: Vec<i32>,
-    best: Vec<u32>,
+    shifts: Shifts,
     once: Set,
     twice: Set,
     fresh: Set,
+    /// Unsure pixels of each block.
+    unsure: Vec<u32>,
+    /// What unsure pixels of each block found elsewhere; empty where none did.
+    found: Vec<Set>,
+    free: Free,
+}
+
+/// Right pixels of a row that no good match has.
+#[derive(Debug, Default)]
+struct Free {
+    taken: Vec<u8>,
+    /// Their descriptors and columns, side by side.
+    descriptors: Vec<u64>,
+    columns: Vec<u16>,
+    /// How many lie left of each column.
+    before: Vec<u16>,
 }
 
 /// What a search reads.
@@ -96,6 +113,9 @@ pub(crate) struct Scene<'a> {
     pub right: &'a Descriptors,
     /// Left images, to tell dark pixels.
     pub images: &'a [&'a Image<Sample>],
+    /// What each camera saw: nothing is looked for elsewhere.
+    pub left_mask: Option<&'a Image<u8>>,
+    pub right_mask: Option<&'a Image<u8>>,
 }
 
 impl Scene<'_> {
@@ -127,9 +147,12 @@ impl Search {
                 let last = (band + 2).min(bands) * half;
                 let mut out = Band { y: band * SEED_ROWS, width, disparity, cost };
                 scratch.with(|s| {
+                    s.unsure.clear();
                     for x in (0..width).step_by(BLOCK) {
-                        search_block(scene, &seeds[first..last], x, s, &mut out);
+                        let unsure = search_block(scene, &seeds[first..last], x, s, &mut out);
+                        s.unsure.push(unsure);
                     }
+                    search_unsure(scene, s, &mut out);
                 });
             });
     }
@@ -192,8 +215,15 @@ fn seed_row(scene: &Scene<'_>, y: usize, s: &mut Scratch, seeds: &mut [i16]) {
     }
 }
 
-/// Searches a block of [`BLOCK`] x [`SEED_ROWS`] pixels from column `x`.
-fn search_block(scene: &Scene<'_>, seeds: &[i16], x: usize, s: &mut Scratch, out: &mut Band<'_>) {
+/// Searches a block of [`BLOCK`] x [`SEED_ROWS`] pixels from column `x` among its seeds; returns how
+/// many pixels are unsure.
+fn search_block(
+    scene: &Scene<'_>,
+    seeds: &[i16],
+    x: usize,
+    s: &mut Scratch,
+    out: &mut Band<'_>,
+) -> u32 {
     let count = scene.count();
     let min = scene.range.min_px;
     let half = out.width.div_ceil(2);
@@ -217,53 +247,116 @@ fn search_block(scene: &Scene<'_>, seeds: &[i16], x: usize, s: &mut Scratch, out
         let (up, down) = s.once.beside(i);
         s.fresh.words[i] = s.once.words[i] & (s.twice.words[i] | up | down);
     }
-    std::mem::swap(&mut s.once, &mut s.fresh);
-    let rows = out.disparity.len() / out.width;
-    shifts_for(scene, &s.once, x, out.width, &mut s.shifts);
-    let mut unsure = 0;
-    for row in 0..rows {
-        let mut best = [0; BLOCK];
-        match_row(scene, out.y + row, x, &s.shifts, &mut best);
-        unsure += write_row(&s.shifts, row, x, &best, false, out);
-    }
-    if unsure == 0 {
+    shifts_for(scene, &s.fresh, x, out.width, &mut s.shifts);
+    match_block(scene, x, &s.shifts, false, out)
+}
+
+/// Looks for the unsure pixels of a band over the whole range: every fourth of them does, and what they
+/// find, all pixels of their block try.
+///
+/// Each looks only among the right pixels of its row that nothing matches well. A pixel that only the left
+/// camera sees finds few of them; one of a thin object finds the object's.
+fn search_unsure(scene: &Scene<'_>, s: &mut Scratch, out: &mut Band<'_>) {
+    if s.unsure.iter().all(|unsure| *unsure == 0) {
         return;
     }
-    // Every fourth of the unsure pixels looks everywhere; what they find, all others try.
-    s.fresh.clear(count);
-    let mut found = 0;
+    let count = scene.count();
+    let empty = || Set { words: Vec::with_capacity(count.div_ceil(64)) };
+    s.found.resize_with(s.unsure.len(), empty);
+    s.found.iter_mut().for_each(|found| found.words.clear());
+    let rows = out.disparity.len() / out.width;
     for row in (0..rows).step_by(2) {
-        // Rows in turn look at even and at odd columns: a wire aslant may lie on one kind alone.
-        for column in (row / 2 % 2..BLOCK.min(out.width - x)).step_by(2) {
-            if u32::from(out.cost[row * out.width + x + column]) <= UNSURE_COST {
+        let y = out.y + row;
+        let costs = &out.cost[row * out.width..][..out.width];
+        let left_mask = scene.left_mask.map(|mask| mask.row(y));
+        let mut ready = false;
+        for (block, _) in s.unsure.iter().enumerate().filter(|(_, unsure)| **unsure > 0) {
+            let x = block * BLOCK;
+            // Rows in turn look at even and at odd columns: a wire aslant may lie on one kind alone.
+            let columns = (row / 2 % 2..BLOCK.min(out.width - x)).step_by(2);
+            let unsure = |column: &usize| {
+                u32::from(costs[x + column]) > UNSURE_COST
+                    && left_mask.is_none_or(|mask| mask[x + column] != 0)
+            };
+            let mut columns = columns.filter(unsure).peekable();
+            if columns.peek().is_none() {
                 continue;
             }
-            let y = out.y + row;
-            if is_dark(scene.images, x + column, y) {
-                continue;
-            }
-            if let Some(d) = search_pixel(scene, x + column, y, &mut s.left, &mut s.best) {
-                let at = (d - min) as usize;
-                if !s.once.contains(at) {
-                    s.fresh.insert(at);
-                    found += 1;
+            let spans = spans(scene, x, y);
+            for column in columns.filter(|&column| spans[column] >= DARK) {
+                if !ready {
+                    let disparities = &out.disparity[row * out.width..][..out.width];
+                    s.free.fill(scene, y, disparities, costs);
+                    ready = true;
+                }
+                let value = scene.left.row(y)[MARGIN + x + column];
+                if let Some(d) = s.free.search(scene, x + column, value) {
+                    let found = &mut s.found[block];
+                    if found.words.is_empty() {
+                        found.clear(count);
+                    }
+                    found.insert((d - scene.range.min_px) as usize);
                 }
             }
         }
     }
-    if found == 0 {
-        return;
+    for (block, found) in s.found.iter().enumerate().filter(|(_, found)| !found.words.is_empty()) {
+        shifts_for(scene, found, block * BLOCK, out.width, &mut s.shifts);
+        match_block(scene, block * BLOCK, &s.shifts, true, out);
     }
-    shifts_for(scene, &s.fresh, x, out.width, &mut s.shifts);
-    for row in 0..rows {
-        let mut best = [0; BLOCK];
-        match_row(scene, out.y + row, x, &s.shifts, &mut best);
-        write_row(&s.shifts, row, x, &best, true, out);
+}
+
+impl Free {
+    /// Takes the row's matches.
+    fn fill(&mut self, scene: &Scene<'_>, y: usize, disparities: &[i16], costs: &[u8]) {
+        let width = disparities.len();
+        match scene.right_mask {
+            Some(mask) => {
+                self.taken.clear();
+                self.taken.extend(mask.row(y).iter().map(|seen| u8::from(*seen == 0)));
+            }
+            None => {
+                self.taken.clear();
+                self.taken.resize(width, 0);
+            }
+        }
+        for (x, (&d, &cost)) in disparities.iter().zip(costs).enumerate() {
+            if cost <= TAKEN_COST {
+                // Only disparities with a counterpart inside the image have a cost.
+                self.taken[(x as i32 - i32::from(d)) as usize] = 1;
+            }
+        }
+        self.descriptors.resize(width, 0);
+        self.columns.resize(width, 0);
+        self.before.resize(width + 1, 0);
+        let row = &scene.right.row(y)[MARGIN..][..width];
+        let mut n = 0;
+        for (x, (taken, descriptor)) in self.taken.iter().zip(row).enumerate() {
+            self.before[x] = n as u16;
+            (self.descriptors[n], self.columns[n]) = (*descriptor, x as u16);
+            n += usize::from(*taken == 0);
+        }
+        self.before[width] = n as u16;
+    }
+
+    /// The whole range for pixel `x`; `None` where nothing matches well.
+    fn search(&self, scene: &Scene<'_>, x: usize, value: u64) -> Option<i32> {
+        let last = self.taken.len() as i64 - 1;
+        let from = (x as i64 - i64::from(scene.range.max_px)).max(0);
+        let to = (x as i64 - i64::from(scene.range.min_px)).min(last);
+        if from > to {
+            return None;
+        }
+        let (from, to) = (self.before[from as usize], self.before[to as usize + 1]);
+        let (from, to) = (usize::from(from), usize::from(to));
+        let (bits, at) = nearest(scene.level, value, &self.descriptors[from..to])?;
+        let most = if scene.images.len() < FRAMES_MANY { FOUND_COST_FEW } else { FOUND_COST };
+        (bits <= most).then(|| x as i32 - i32::from(self.columns[from + at]))
     }
 }
 
 /// Disparities of a set and their neighbours that have a counterpart for some pixel of the block.
-fn shifts_for(scene: &Scene<'_>, set: &Set, x: usize, width: usize, shifts: &mut Vec<i32>) {
+fn shifts_for(scene: &Scene<'_>, set: &Set, x: usize, width: usize, shifts: &mut Shifts) {
     let (min, count) = (scene.range.min_px, scene.count());
     shifts.clear();
     let from = x as i32 - (width as i32 - 1);
@@ -276,47 +369,144 @@ fn shifts_for(scene: &Scene<'_>, set: &Set, x: usize, width: usize, shifts: &mut
     });
 }
 
-fn match_row(scene: &Scene<'_>, y: usize, x: usize, shifts: &[i32], best: &mut [u32; BLOCK]) {
-    let left = &scene.left.row(y)[MARGIN + x..][..BLOCK];
-    best_candidates(scene.level, left, scene.right.row(y), MARGIN + x, shifts, best);
-}
-
-/// Stores a block's row; with `better`, only where the cost is lower. Returns the unsure pixels.
-fn write_row(
-    shifts: &[i32],
-    row: usize,
+/// Matches a block's rows; with `better`, takes only what costs less than what is there. Returns the
+/// unsure pixels.
+fn match_block(
+    scene: &Scene<'_>,
     x: usize,
-    best: &[u32; BLOCK],
+    shifts: &Shifts,
     better: bool,
     out: &mut Band<'_>,
-) -> usize {
+) -> u32 {
     let columns = BLOCK.min(out.width - x);
-    let at = row * out.width + x;
-    let disparity = &mut out.disparity[at..at + columns];
-    let cost = &mut out.cost[at..at + columns];
+    let rows = out.disparity.chunks_mut(out.width).zip(out.cost.chunks_mut(out.width));
     let mut unsure = 0;
-    for (i, (d, c)) in disparity.iter_mut().zip(cost).enumerate() {
-        let bits = best[i] >> 16;
-        let shift = shifts.get((best[i] & 0xFFFF) as usize).copied();
-        let shift = shift.filter(|&s| (0..out.width as i32).contains(&((x + i) as i32 - s)));
-        match shift {
-            Some(shift) if !better || bits < u32::from(*c) => {
-                *d = shift as i16;
-                *c = bits as u8;
-            }
-            None if !better => {
-                *d = INVALID;
-                *c = u8::MAX;
-            }
-            _ => {}
+    for (y, (disparity, cost)) in (out.y..).zip(rows) {
+        let left = &scene.left.row(y)[MARGIN + x..][..BLOCK];
+        let mut best = [0; BLOCK];
+        best_candidates(scene.level, left, scene.right.row(y), MARGIN + x, shifts, &mut best);
+        let (disparity, cost) = (&mut disparity[x..][..columns], &mut cost[x..][..columns]);
+        let at = (x as i32, out.width as i32);
+        // Loops of a known length have no remainder, which would not be by vectors.
+        let whole = disparity.first_chunk_mut::<BLOCK>().zip(cost.first_chunk_mut::<BLOCK>());
+        if let Some((disparity, cost)) = whole {
+            write_row(scene.level, &best, shifts.first(), at, better, disparity, cost, &mut unsure);
+            continue;
         }
-        unsure += usize::from(u32::from(*c) > UNSURE_COST);
+        let (mut disparities, mut costs) = ([INVALID; BLOCK], [0; BLOCK]);
+        disparities[..columns].copy_from_slice(disparity);
+        costs[..columns].copy_from_slice(cost);
+        let (to, costs_to, mut beyond) = (&mut disparities, &mut costs, 0);
+        write_row(scene.level, &best, shifts.first(), at, better, to, costs_to, &mut beyond);
+        let unsure_here = costs[..columns].iter().filter(|c| u32::from(**c) > UNSURE_COST);
+        unsure += unsure_here.count() as u32;
+        disparity.copy_from_slice(&disparities[..columns]);
+        cost.copy_from_slice(&costs[..columns]);
     }
     unsure
 }
 
+/// Takes over the best candidates of a block's row, which begins at column `at.0` of `at.1`.
+#[allow(clippy::too_many_arguments)]
+fn write_row(
+    level: Level,
+    best: &[u32; BLOCK],
+    first: i32,
+    at: (i32, i32),
+    better: bool,
+    disparity: &mut [i16; BLOCK],
+    cost: &mut [u8; BLOCK],
+    unsure: &mut u32,
+) {
+    vectorised!(
+        level,
+        write_loop(
+            best: &[u32; BLOCK] = best,
+            first: i32 = first,
+            at: (i32, i32) = at,
+            better: bool = better,
+            disparity: &mut [i16; BLOCK] = disparity,
+            cost: &mut [u8; BLOCK] = cost,
+            unsure: &mut u32 = unsure,
+        )
+    );
+}
+
+#[inline(always)]
+fn write_loop(
+    best: &[u32; BLOCK],
+    first: i32,
+    (x, width): (i32, i32),
+    better: bool,
+    disparity: &mut [i16; BLOCK],
+    cost: &mut [u8; BLOCK],
+    unsure: &mut u32,
+) {
+    if !better {
+        disparity.fill(INVALID);
+        cost.fill(u8::MAX);
+    }
+    let mut count = 0;
+    for i in 0..BLOCK {
+        let shift = first + (best[i] & 0xFFFF) as i32;
+        let inside = ((x + i as i32 - shift) as u32) < width as u32;
+        // Without candidates all bits are ones.
+        let bits = best[i] >> 16;
+        let take = inside & (bits < u32::from(cost[i]));
+        cost[i] = if take { bits as u8 } else { cost[i] };
+        disparity[i] = if take { shift as i16 } else { disparity[i] };
+        count += u32::from(u32::from(cost[i]) > UNSURE_COST);
+    }
+    *unsure += count;
+}
+
+/// By how much the samples of a block's pixels in row `y` span over time and the neighbours two pixels
+/// away: what [`is_dark`] looks at.
+fn spans(scene: &Scene<'_>, x: usize, y: usize) -> [i16; BLOCK] {
+    let (width, height) = (scene.images[0].width(), scene.images[0].height());
+    let mut spans = [0; BLOCK];
+    if x < 2 || x + BLOCK + 2 > width {
+        for (column, to) in spans.iter_mut().enumerate().take(width - x) {
+            *to = span(scene.images, x + column, y);
+        }
+        return spans;
+    }
+    vectorised!(
+        scene.level,
+        spans_loop(
+            images: &[&Image<Sample>] = scene.images,
+            x: usize = x,
+            rows: [usize; 3] = [y.saturating_sub(2), y, (y + 2).min(height - 1)],
+            spans: &mut [i16; BLOCK] = &mut spans,
+        )
+    );
+    spans
+}
+
+#[inline(always)]
+fn spans_loop(images: &[&Image<Sample>], x: usize, rows: [usize; 3], spans: &mut [i16; BLOCK]) {
+    let (mut low, mut high) = ([i16::MAX; BLOCK], [i16::MIN; BLOCK]);
+    for image in images {
+        let [above, own, below] = rows.map(|y| image.row(y));
+        for samples in [&above[x..], &own[x - 2..], &own[x..], &own[x + 2..], &below[x..]] {
+            let samples = &samples[..BLOCK];
+            for i in 0..BLOCK {
+                low[i] = low[i].min(samples[i]);
+                high[i] = high[i].max(samples[i]);
+            }
+        }
+    }
+    for i in 0..BLOCK {
+        spans[i] = high[i].saturating_sub(low[i]);
+    }
+}
+
 /// Whether no dot ever lights the pixel or its neighbours two pixels away.
 pub(crate) fn is_dark(images: &[&Image<Sample>], x: usize, y: usize) -> bool {
+    span(images, x, y) < DARK
+}
+
+fn span(images: &[&Image<Sample>], x: usize, y: usize) -> i16 {
     let (width, height) = (images[0].width(), images[0].height());
     let columns = [x.saturating_sub(2), x, (x + 2).min(width - 1)];
     let rows = [y.saturating_sub(2), (y + 2).min(height - 1)];
@@ -328,36 +518,5 @@ pub(crate) fn is_dark(images: &[&Image<Sample>], x: usize, y: usize) -> bool {
             (low, high) = (low.min(v), high.max(v));
         }
     }
-    high.saturating_sub(low) < DARK
-}
-
-/// The whole range for one pixel; `None` where nothing matches well.
-fn search_pixel(
-    scene: &Scene<'_>,
-    x: usize,
-    y: usize,
-    left: &mut Vec<u64>,
-    best: &mut Vec<u32>,
-) -> Option<i32> {
-    let width = scene.left.width() as i64;
-    let from = (x as i64 - i64::from(scene.range.max_px)).max(0);
-    let to = (x as i64 - i64::from(scene.range.min_px)).min(width - 1);
-    if from > to {
-        return None;
-    }
-    let count = (to - from + 1) as usize;
-    let row = scene.right.row(y);
-    let origin = MARGIN + from as usize;
-    let padded = count.next_multiple_of(BLOCK);
-    left.clear();
-    left.resize(padded, scene.left.row(y)[MARGIN + x]);
-    best.resize(padded, 0);
-    best_candidates(scene.level, left, row, origin, &[0], best);
-    let lowest = best[..count].iter().copied().min()?;
-    let most = if scene.images.len() < FRAMES_MANY { FOUND_COST_FEW } else { FOUND_COST };
-    if lowest >> 16 > most {
-        return None;
-    }
-    let at = best[..count].iter().position(|&b| b == lowest)?;
-    Some((x as i64 - (from + at as i64)) as i32)
+    high.saturating_sub(low)
 }

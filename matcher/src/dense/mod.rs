@@ -36,8 +36,11 @@ use tile::{Job, Output, Tile};
 /// Columns a tile fits. Narrower strips would keep a tile's rows in a core's second-level cache, but cost
 /// more than that saves: memory gives short pieces of twenty images' rows slowly.
 const STRIP: usize = 2048;
-/// Fewest rows of a task: each computes some rows beyond its own anew.
+/// Fewest rows of a task: each that does not follow its thread's last one computes some rows beyond its
+/// own anew.
 const BAND: usize = 64;
+/// Tasks of a thread: they let others take over what a busy core leaves.
+const TASKS: usize = 4;
 
 /// The dense fit; keeps its buffers between frames.
 #[derive(Debug)]
@@ -47,6 +50,8 @@ pub struct DenseFit {
     shape: ShapeFunction,
     surface_px: f32,
     tiles: PerThread<Tile>,
+    /// Number of fits made.
+    stamp: u64,
     zero: Image<Sample>,
 }
 
@@ -78,6 +83,7 @@ impl DenseFit {
             shape,
             surface_px,
             tiles: PerThread::default(),
+            stamp: 0,
             zero: Image::new(0, 0, 0),
         }
     }
@@ -136,8 +142,10 @@ impl DenseFit {
         left[..frames].copy_from_slice(stack.left);
         right[..frames].copy_from_slice(stack.right);
         let even = frames.next_multiple_of(2);
+        self.stamp += 1;
         let job = Job {
             level: self.level,
+            stamp: self.stamp,
             left: &left[..even],
             right: &right[..even],
             frames,
@@ -152,7 +160,7 @@ impl DenseFit {
         let tiles = self.tiles.ready();
         // Results do not depend on where bands end.
         let band_rows = match again {
-            None => height.div_ceil(2 * threads).max(BAND),
+            None => height.div_ceil(TASKS * threads).max(BAND),
             Some(_) => BAND,
         };
         let rows = width * band_rows;

@@ -114,8 +114,55 @@ fn slide_lanes<V: Lanes>(
     threes: &mut [f32],
     out: &mut [f32],
 ) {
+    if V::AHEAD && V::COUNT == PAD && radius == 4 {
+        slide_ahead::<V>(enters, leaves, len, column, out);
+        return;
+    }
     columns_lanes::<V>(enters, leaves, len, column);
     across::<V>(radius, len, column, threes, out);
+}
+
+/// [`slide_lanes`] for nine columns in one go: sums of three columns, and of three of these, from
+/// neighbouring vectors of 16 in registers, without loads across cache lines.
+#[inline(always)]
+fn slide_ahead<V: Lanes>(
+    enters: &[f32],
+    leaves: &[f32],
+    len: usize,
+    column: &mut [f32],
+    out: &mut [f32],
+) {
+    let zero = V::splat(0.0);
+    let to = column.as_mut_ptr();
+    // Column sums of the vector at `i`, brought up to date; pads stay zero.
+    let slid = |i: usize| {
+        if i >= PAD + len {
+            return zero;
+        }
+        // SAFETY: `i + COUNT <= PAD + len`, as `len` is a multiple of COUNT.
+        unsafe {
+            let change = V::load(enters.as_ptr().add(i)).sub(V::load(leaves.as_ptr().add(i)));
+            let sum = V::load(to.add(i)).add(change);
+            sum.store(to.add(i));
+            sum
+        }
+    };
+    let three = |before: V, own: V, after: V| {
+        // The last lane of the vector before, the first of the one after.
+        before.ahead::<15>(own).add(own).add(own.ahead::<1>(after))
+    };
+    let (mut own, mut after) = (slid(PAD), slid(PAD + V::COUNT));
+    let mut threes = [three(zero, zero, own), three(zero, own, after)];
+    for i in (PAD..PAD + len).step_by(V::COUNT) {
+        let next = slid(i + 2 * V::COUNT);
+        let last = three(own, after, next);
+        let left = threes[0].ahead::<13>(threes[1]);
+        let sum = left.add(threes[1]).add(threes[1].ahead::<3>(last));
+        // SAFETY: `i + COUNT <= PAD + len`.
+        unsafe { sum.store(out.as_mut_ptr().add(i)) };
+        (own, after) = (after, next);
+        threes = [threes[1], last];
+    }
 }
 
 /// Sums over columns: of three, then of threes, which takes six loads a pixel for nine columns.
@@ -278,6 +325,23 @@ impl<const K: usize> Columns<K> {
         i: usize,
     ) -> [V; L] {
         let radius = if R == 0 { radius } else { R };
+        if V::AHEAD && V::COUNT == PAD && R == 4 {
+            // SAFETY: the caller's promise; there are COUNT columns more on both sides.
+            let [before, own, after] = [0, PAD, 2 * PAD]
+                .map(|at| unsafe { V::load(self.0.get_unchecked(power).as_ptr().add(at + i)) });
+            let taps = [
+                before.ahead::<12>(own),
+                before.ahead::<13>(own),
+                before.ahead::<14>(own),
+                before.ahead::<15>(own),
+                own,
+                own.ahead::<1>(after),
+                own.ahead::<2>(after),
+                own.ahead::<3>(after),
+                own.ahead::<4>(after),
+            ];
+            return weighted::<V, L, R>(|j| taps[j], radius, powers);
+        }
         // SAFETY: the caller's promise; the radius is at most PAD.
         let load = |j: usize| unsafe {
             V::load(self.0.get_unchecked(power).as_ptr().add(PAD + i - radius + j))

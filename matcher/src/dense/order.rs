@@ -49,8 +49,8 @@ const SIGMA_PX: (f32, f32) = (0.002, 0.05);
 const LOSS_MIN: f32 = 1e-4;
 /// Rows under the smoothing.
 const SIDE: usize = 2 * RADIUS + 1;
-/// Rows of a task.
-const BAND: usize = 64;
+/// Rows of a task, which looks at [`SIDE`] - 1 more.
+const BAND: usize = 96;
 
 /// Chooses orders; keeps its buffers between frames.
 #[derive(Debug, Default)]
@@ -166,37 +166,24 @@ impl Buffers {
 
     /// Takes in the row that is step `y` of a band: estimates of both orders, or beyond the image none.
     fn enter(&mut self, level: Level, estimates: Option<(&[f32], &[f32])>, y: usize) {
-        // What leaves the window is in the slot that is filled next.
-        let len = self.column.len() - 2 * PAD;
-        self.slide(level, y, len, true);
-        self.fill(level, estimates, y);
-        self.slide(level, y, len, false);
-    }
-
-    /// Takes the row in the slot of step `y` off the column sums, or adds it.
-    fn slide(&mut self, level: Level, y: usize, len: usize, leaves: bool) {
-        for (rows, column) in self.rows.iter().zip(&mut self.columns) {
-            let (row, none) = (&rows[y % SIDE][..], &self.nothing[..]);
-            let (enters, leaves) = if leaves { (none, row) } else { (row, none) };
-            slide_columns(level, (enters, leaves), len, column);
-        }
-    }
-
-    fn fill(&mut self, level: Level, estimates: Option<(&[f32], &[f32])>, y: usize) {
+        // What leaves the window is in the slot that is filled.
         let rows = self.rows.each_mut().map(|rows| &mut rows[y % SIDE][..]);
         let Some((first, second)) = estimates else {
-            for row in rows {
-                row.fill(0.0);
+            for (row, column) in rows[..3].iter().zip(&mut self.columns) {
+                let len = row.len() - 2 * PAD;
+                slide_columns(level, (&self.nothing, row), len, column);
             }
+            rows.into_iter().for_each(|row| row.fill(0.0));
             return;
         };
-        let rows = rows.map(|row| &mut row[PAD..PAD + first.len()]);
+        let inner = PAD..PAD + first.len();
         vectorised!(
             level,
             enter_loop(
                 first: &[f32] = first,
                 second: &[f32] = second,
-                rows: [&mut [f32]; 4] = rows,
+                rows: [&mut [f32]; 4] = rows.map(|row| &mut row[inner.clone()]),
+                columns: [&mut [f32]; 3] = self.columns.each_mut().map(|c| &mut c[inner.clone()]),
             )
         );
     }
@@ -235,10 +222,13 @@ impl Buffers {
     }
 }
 
+/// Puts a row's values in the place of the one that leaves the window, and brings the sums of their
+/// columns up to date.
 #[inline(always)]
-fn enter_loop(first: &[f32], second: &[f32], rows: [&mut [f32]; 4]) {
+fn enter_loop(first: &[f32], second: &[f32], rows: [&mut [f32]; 4], columns: [&mut [f32]; 3]) {
     let [difference, square, valid, kept] = rows;
     let n = first.len();
+    let [differences, squares, count] = columns.map(|column| &mut column[..n]);
     let (second, difference, square) = (&second[..n], &mut difference[..n], &mut square[..n]);
     let (valid, kept) = (&mut valid[..n], &mut kept[..n]);
     for i in 0..n {
@@ -246,9 +236,13 @@ fn enter_loop(first: &[f32], second: &[f32], rows: [&mut [f32]; 4]) {
         // Differences of a pixel or more are no matter of order.
         let good = e.abs() < 1.0;
         let e = if good { e } else { 0.0 };
+        let one = if good { 1.0 } else { 0.0 };
+        differences[i] += e - difference[i];
+        squares[i] += e * e - square[i];
+        count[i] += one - valid[i];
         difference[i] = e;
         square[i] = e * e;
-        valid[i] = if good { 1.0 } else { 0.0 };
+        valid[i] = one;
         kept[i] = if good { first[i] } else { 0.0 };
     }
 }

@@ -23,6 +23,8 @@ use crate::{Image, Level, Sample, aligned::Aligned, lanes::vectorised};
 /// What all tiles of a frame share.
 pub(crate) struct Job<'a> {
     pub level: Level,
+    /// Another one for each frame.
+    pub stamp: u64,
     /// Left images, an even number.
     pub left: &'a [&'a Image<Sample>],
     /// Right images, likewise.
@@ -100,6 +102,9 @@ fn around<T>(ring: &Ring, y: isize, radius: usize, work: impl FnOnce(&[&[f32]]) 
 /// Buffers of a tile, kept between tiles.
 #[derive(Debug, Default)]
 pub(crate) struct Tile {
+    /// Stamp and columns of the band that was fitted last, and the row after it: what follows goes on
+    /// from its rows.
+    next: Option<(u64, (usize, usize), usize)>,
     len: usize,
     words: usize,
     gradient: Aligned<i32>,
@@ -241,10 +246,16 @@ impl Tile {
         let x0 = x_from.saturating_sub(halo);
         let x1 = (x_to + halo).min(width);
         let len = (x1 - x0).next_multiple_of(32);
-        self.resize(len, job.radius, job.left.len() / 2);
+        let here = (job.stamp, (x_from, x_to), y_from);
+        let goes_on = self.next == Some(here);
+        if !goes_on {
+            self.resize(len, job.radius, job.left.len() / 2);
+        }
+        self.next = Some((job.stamp, (x_from, x_to), y_from + rows));
         let (top, end) = (y_from as isize, (y_from + rows) as isize);
         let inside = |y: isize| (0..height as isize).contains(&y);
-        for y in top - 4 * r..end + 4 * r {
+        let begin = if goes_on { top + 4 * r } else { top - 4 * r };
+        for y in begin..end + 4 * r {
             self.enter(job, y, (x0, x1), inside(y));
             if y - r >= top - 3 * r {
                 self.normalise(job, y - r);

@@ -56,69 +56,113 @@ pub(super) fn travels(
     far as f32 > TRAVEL_PART * valid as f32
 }
 
-/// Whether much of what the images show lit is lost, and fewer frames, `fewer`, would find far more of
-/// it, or find it elsewhere: tried on the rows that lost most.
-pub(super) fn loses(
-    level: Level,
-    range: DisparityRange,
-    stack: &StereoStack<'_>,
-    fewer: &StereoStack<'_>,
-    (disparity, rate): (&Image<f32>, Option<&Image<f32>>),
-) -> bool {
-    let (width, height) = (stack.width(), stack.height());
-    let lit = |y: usize, x: usize| !is_dark(stack.left, x, y);
-    // Per band: lit samples, and those of them that are found.
-    let mut bands = vec![(0usize, 0usize); height.div_ceil(BAND)];
-    for y in (GRID / 2..height).step_by(GRID) {
-        let (seen, found) = &mut bands[y / BAND];
-        for x in (GRID / 2..width).step_by(GRID).filter(|&x| lit(y, x)) {
-            *seen += 1;
-            *found += usize::from(!disparity.row(y)[x].is_nan());
+/// A match of a few rows with fewer frames; keeps its buffers.
+#[derive(Debug)]
+pub(super) struct Trial {
+    coarse: Coarse,
+    map: CoarseMap,
+    left: Vec<Image<Sample>>,
+    right: Vec<Image<Sample>>,
+    /// Per band: lit samples, and those of them that are found.
+    bands: Vec<(usize, usize)>,
+}
+
+impl Trial {
+    pub fn new(level: Level, range: DisparityRange) -> Self {
+        Self {
+            coarse: Coarse::new(level, range),
+            map: CoarseMap::new(0, 0),
+            left: Vec::new(),
+            right: Vec::new(),
+            bands: Vec::new(),
         }
     }
-    let sum = |of: fn(&(usize, usize)) -> usize| bands.iter().map(of).sum::<usize>() as f32;
-    let (seen, found) = (sum(|b| b.0), sum(|b| b.1));
-    let samples = (width / GRID * (height / GRID)) as f32;
-    if seen < LIT_PART * samples || found >= FOUND_PART * seen {
-        return false;
-    }
-    let most = bands.iter().enumerate().max_by_key(|(_, (seen, found))| seen - found);
-    let Some((band, &(seen, found))) = most else { return false };
-    let rows = band * BAND..((band + 1) * BAND).min(height);
-    let crop = |images: &[&Image<Sample>]| -> Vec<Image<Sample>> {
-        let part = |image: &&Image<Sample>| {
-            let pixels = image.as_slice()[rows.start * width..rows.end * width].to_vec();
-            Image::from_vec(width, rows.len(), pixels)
-        };
-        images.iter().filter_map(part).collect()
-    };
-    let (left, right) = (crop(fewer.left), crop(fewer.right));
-    let (left, right): (Vec<_>, Vec<_>) = (left.iter().collect(), right.iter().collect());
-    let part = StereoStack::new(&left, &right);
-    let (mut coarse, mut map) = (Coarse::new(level, range), CoarseMap::new(0, 0));
-    coarse.describe(&part);
-    coarse.search(&part, true, &mut map);
-    // The mean of the fewer frames' times against the newest.
-    let mean_time = match fewer.times_s {
-        Some(times) => {
-            let newest = times.last().copied().unwrap_or(0.0);
-            times.iter().map(|t| t - newest).sum::<f64>() as f32 / times.len() as f32
-        }
-        None => -0.5 * fewer.frames().saturating_sub(1) as f32,
-    };
-    let (mut again, mut both, mut off) = (0, 0, 0);
-    for y in (rows.start + GRID / 2..rows.end).step_by(GRID) {
-        for x in (GRID / 2..width).step_by(GRID).filter(|&x| lit(y, x)) {
-            let (now, before) = (map.disparity.row(y - rows.start)[x], disparity.row(y)[x]);
-            if now == INVALID {
-                continue;
+
+    /// Whether much of what the images show lit is lost, and fewer frames, `fewer`, would find far more
+    /// of it, or find it elsewhere: tried on the rows that lost most.
+    pub fn loses(
+        &mut self,
+        stack: &StereoStack<'_>,
+        fewer: &StereoStack<'_>,
+        (disparity, rate): (&Image<f32>, Option<&Image<f32>>),
+    ) -> bool {
+        let (width, height) = (stack.width(), stack.height());
+        let lit = |y: usize, x: usize| !is_dark(stack.left, x, y);
+        self.bands.clear();
+        self.bands.resize(height.div_ceil(BAND), (0, 0));
+        for y in (GRID / 2..height).step_by(GRID) {
+            let (seen, found) = &mut self.bands[y / BAND];
+            for x in (GRID / 2..width).step_by(GRID) {
+                // What is found is lit: the images are looked at only where nothing is.
+                let here = !disparity.row(y)[x].is_nan();
+                *found += usize::from(here);
+                *seen += usize::from(here || lit(y, x));
             }
-            again += 1;
-            let moved = rate.map_or(0.0, |rate| rate.row(y)[x]) * mean_time;
-            let apart = (f32::from(now) - before - moved).abs();
-            both += usize::from(apart < OFF_PX.1);
-            off += usize::from(apart > OFF_PX.0 && apart < OFF_PX.1);
         }
+        let sum =
+            |of: fn(&(usize, usize)) -> usize| self.bands.iter().map(of).sum::<usize>() as f32;
+        let (seen, found) = (sum(|b| b.0), sum(|b| b.1));
+        let samples = (width / GRID * (height / GRID)) as f32;
+        if seen < LIT_PART * samples || found >= FOUND_PART * seen {
+            return false;
+        }
+        let most = self.bands.iter().enumerate().max_by_key(|(_, (seen, found))| seen - found);
+        let Some((band, &(seen, found))) = most else { return false };
+        // As many rows for the last band, so that buffers keep their size.
+        let count = BAND.min(height);
+        let top = (band * BAND).min(height - count);
+        copy_rows(fewer.left, (top, count), &mut self.left);
+        copy_rows(fewer.right, (top, count), &mut self.right);
+        let frames = fewer.frames();
+        let (left, right): ([_; 16], [_; 16]) = (
+            std::array::from_fn(|k| &self.left[k.min(frames - 1)]),
+            std::array::from_fn(|k| &self.right[k.min(frames - 1)]),
+        );
+        let part = StereoStack::new(&left[..frames], &right[..frames]);
+        self.coarse.describe(&part);
+        self.coarse.search(&part, true, &mut self.map);
+        // The mean of the fewer frames' times against the newest.
+        let mean_time = match fewer.times_s {
+            Some(times) => {
+                let newest = times.last().copied().unwrap_or(0.0);
+                times.iter().map(|t| t - newest).sum::<f64>() as f32 / times.len() as f32
+            }
+            None => -0.5 * frames.saturating_sub(1) as f32,
+        };
+        let (mut again, mut both, mut off) = (0, 0, 0);
+        let rows = (GRID / 2..height).step_by(GRID).filter(|y| y / BAND == band);
+        for y in rows {
+            for x in (GRID / 2..width).step_by(GRID).filter(|&x| lit(y, x)) {
+                let (now, before) = (self.map.disparity.row(y - top)[x], disparity.row(y)[x]);
+                if now == INVALID {
+                    continue;
+                }
+                again += 1;
+                let moved = rate.map_or(0.0, |rate| rate.row(y)[x]) * mean_time;
+                let apart = (f32::from(now) - before - moved).abs();
+                both += usize::from(apart < OFF_PX.1);
+                off += usize::from(apart > OFF_PX.0 && apart < OFF_PX.1);
+            }
+        }
+        again > 2 * found + seen / 4 || off as f32 > OFF_PART * both.max(8) as f32
     }
-    again > 2 * found + seen / 4 || off as f32 > OFF_PART * both.max(8) as f32
+}
+
+/// Copies `count` rows from `top` of each image.
+fn copy_rows(
+    images: &[&Image<Sample>],
+    (top, count): (usize, usize),
+    rows: &mut Vec<Image<Sample>>,
+) {
+    let width = images[0].width();
+    if rows.first().is_some_and(|r| (r.width(), r.height()) != (width, count)) {
+        rows.clear();
+    }
+    while rows.len() < images.len() {
+        rows.push(Image::new(width, count, 0));
+    }
+    for (to, image) in rows.iter_mut().zip(images) {
+        let from = &image.as_slice()[top * width..][..count * width];
+        to.as_mut_slice().copy_from_slice(from);
+    }
 }

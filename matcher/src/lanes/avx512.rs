@@ -95,4 +95,13 @@ impl Lanes for F32x16 {
     fn any(mask: __mmask16) -> bool {
         mask != 0
     }
+    const AHEAD: bool = true;
+    #[inline(always)]
+    fn ahead<const K: i32>(self, next: Self) -> Self {
+        // SAFETY: see the impl.
+        unsafe {
+            let (low, high) = (_mm512_castps_si512(self.0), _mm512_castps_si512(next.0));
+            Self(_mm512_castsi512_ps(_mm512_alignr_epi32::<K>(high, low)))
+        }
+    }
 }

@@ -62,6 +62,12 @@ pub(crate) trait Lanes: Copy {
     fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
     /// Whether any lane of the mask holds.
     fn any(mask: Self::Mask) -> bool;
+    /// Whether [`Lanes::ahead`] is there, and faster than a load across two cache lines.
+    const AHEAD: bool = false;
+    /// The lanes from lane K on, and behind them the first of `next`.
+    fn ahead<const K: i32>(self, _next: Self) -> Self {
+        unreachable!("asked only of levels that have it")
+    }
 }
 
 /// Calls a function generic over [`Lanes`] at a level: `dispatch!(level, kernel(a: &[f32], n: usize))`
@@ -69,13 +75,13 @@ pub(crate) trait Lanes: Copy {
 macro_rules! dispatch {
     ($level:expr, $kernel:ident($($arg:ident : $ty:ty = $value:expr),* $(,)?)) => {{
         #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512vl,avx512dq")]
+        #[target_feature(enable = "avx2,fma,popcnt,avx512f,avx512bw,avx512vl,avx512dq")]
         #[allow(clippy::too_many_arguments)]
         fn avx512($($arg: $ty),*) {
             $kernel::<crate::lanes::avx512::F32x16>($($arg),*)
         }
         #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma")]
+        #[target_feature(enable = "avx2,fma,popcnt")]
         #[allow(clippy::too_many_arguments)]
         fn avx2($($arg: $ty),*) {
             $kernel::<crate::lanes::avx2::F32x8>($($arg),*)
@@ -99,13 +105,13 @@ pub(crate) use dispatch;
 macro_rules! vectorised {
     ($level:expr, $kernel:ident($($arg:ident : $ty:ty = $value:expr),* $(,)?)) => {{
         #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512vl,avx512dq")]
+        #[target_feature(enable = "avx2,fma,popcnt,avx512f,avx512bw,avx512vl,avx512dq")]
         #[allow(clippy::too_many_arguments)]
         fn avx512($($arg: $ty),*) {
             $kernel($($arg),*)
         }
         #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2,fma")]
+        #[target_feature(enable = "avx2,fma,popcnt")]
         #[allow(clippy::too_many_arguments)]
         fn avx2($($arg: $ty),*) {
             $kernel($($arg),*)

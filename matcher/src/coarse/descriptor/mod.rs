@@ -46,36 +46,35 @@ impl Test {
 /// The 64 tests for a number of frames: the centre in every frame, its neighbours two pixels away,
 /// the centre between frames, then samples ever farther away.
 fn tests(frames: usize) -> [Test; 64] {
-    let mut tests = Vec::with_capacity(64 + 16);
     let at = |dx, dy| (0..frames).map(move |frame| Test::Mean { dx, dy, frame });
-    tests.extend(at(0, 0));
     let near = [(2, 0), (-2, 0), (0, 2), (0, -2)];
-    for (k, (dx, dy)) in near.into_iter().enumerate() {
+    let beside = near.into_iter().enumerate().flat_map(|(k, (dx, dy))| {
         // Of many frames every second: thin objects are told by their own samples alone.
         let every = if frames > 12 { 2 } else { 1 };
-        tests.extend(at(dx, dy).skip(k % every).step_by(every));
-    }
-    for lag in 1..=frames / 2 {
+        at(dx, dy).skip(k % every).step_by(every)
+    });
+    let time = (1..=frames / 2).flat_map(|lag| {
         // At half the period each pair would come twice.
         let pairs = if 2 * lag == frames { lag } else { frames };
-        tests.extend((0..pairs).map(|f| Test::Time { frame: f, other: (f + lag) % frames }));
-    }
-    let mut far: Vec<(isize, isize)> = (-4..=4isize)
-        .flat_map(|dy| (-4..=4isize).map(move |dx| (dx, dy)))
-        .filter(|p| *p != (0, 0) && !near.contains(p))
-        .collect();
-    far.sort_by_key(|(dx, dy)| (dx * dx + dy * dy, *dy, *dx));
-    for (dx, dy) in far {
-        tests.extend(at(dx, dy));
-    }
-    std::array::from_fn(|k| tests[k])
+        (0..pairs).map(move |f| Test::Time { frame: f, other: (f + lag) % frames })
+    });
+    let reach = REACH as isize;
+    let mut around: [(isize, isize); ROWS * ROWS] =
+        std::array::from_fn(|i| ((i % ROWS) as isize - reach, (i / ROWS) as isize - reach));
+    around.sort_unstable_by_key(|(dx, dy)| (dx * dx + dy * dy, *dy, *dx));
+    let far = around.into_iter().filter(|p| *p != (0, 0) && !near.contains(p));
+    let far = far.flat_map(|(dx, dy)| at(dx, dy));
+    let mut all = at(0, 0).chain(beside).chain(time).chain(far);
+    // One frame alone has 81 samples in reach.
+    let spare = Test::Time { frame: 0, other: 0 };
+    std::array::from_fn(|_| all.next().unwrap_or(spare))
 }
 
 /// Rows of a task.
 const BAND: usize = 32;
-/// Blocks of a strip: 1280 columns. Narrower ones would keep ten frames' rows in the first-level cache,
+/// Blocks of a strip: 1536 columns. Narrower ones would keep ten frames' rows in the first-level cache,
 /// but memory gives short pieces of many rows at half its speed.
-const STRIP: usize = 40;
+const STRIP: usize = 48;
 /// Farthest that a window or a test reaches to either side.
 const REACH: usize = 4;
 /// Most rows of a window.
@@ -222,17 +221,33 @@ fn describe_edge(
     out: &mut [u64],
 ) {
     let (width, height) = (images[0].width(), images[0].height());
-    for x in columns {
-        out[x] = tests.iter().enumerate().fold(0, |bits, (k, test)| {
-            let (value, than) = match *test {
+    let mut columns = columns.peekable();
+    while columns.peek().is_some() {
+        // Test by test, for as many columns as there are at both sides of a row together.
+        let mut some = [0; 2 * REACH];
+        let count = some.iter_mut().zip(&mut columns).map(|(to, x)| *to = x).count();
+        let some = &some[..count];
+        let mut bits = [0_u64; 2 * REACH];
+        for (k, test) in tests.iter().enumerate() {
+            let bits = bits.iter_mut().zip(some);
+            match *test {
                 Test::Mean { dx, dy, frame } => {
                     let row = images[frame].row(clamp(y, dy, height));
-                    (row[clamp(x, dx, width)], mean[x - from])
+                    for (bits, &x) in bits {
+                        *bits |= u64::from(row[clamp(x, dx, width)] > mean[x - from]) << k;
+                    }
                 }
-                Test::Time { frame, other } => (images[frame].row(y)[x], images[other].row(y)[x]),
-            };
-            bits | u64::from(value > than) << k
-        });
+                Test::Time { frame, other } => {
+                    let (row, than) = (images[frame].row(y), images[other].row(y));
+                    for (bits, &x) in bits {
+                        *bits |= u64::from(row[x] > than[x]) << k;
+                    }
+                }
+            }
+        }
+        for (bits, &x) in bits.iter().zip(some) {
+            out[x] = *bits;
+        }
     }
 }
 

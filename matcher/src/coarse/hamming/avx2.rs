@@ -28,10 +28,10 @@ pub(super) unsafe fn search(
             }
             let mut b = [_mm256_set1_epi64x(i64::from(u32::MAX)); 4];
             let from = origin + at;
-            for (c, &shift) in shifts.iter().enumerate() {
+            for &shift in shifts {
                 // SAFETY: the candidate lies inside for the whole block.
                 let r = unsafe { right.as_ptr().offset(from as isize - shift as isize) };
-                let index = _mm256_set1_epi64x(c as i64);
+                let index = _mm256_set1_epi64x(i64::from(shift - shifts[0]));
                 for k in 0..4 {
                     // SAFETY: as above.
                     let r = unsafe { _mm256_loadu_si256(r.add(4 * k).cast()) };
@@ -59,4 +59,14 @@ pub(super) unsafe fn search(
             }
         }
     }
+}
+
+/// Distance << 32 | index of the row's nearest; all ones for none. One pixel at a time: the bit counter
+/// is faster than tables of nibbles where nothing else is wanted.
+///
+/// # Safety
+/// The processor has the feature.
+#[target_feature(enable = "popcnt")]
+pub(super) unsafe fn nearest(value: u64, row: &[u64]) -> u64 {
+    super::scalar::nearest(value, row)
 }

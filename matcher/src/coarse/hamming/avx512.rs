@@ -6,7 +6,7 @@ use super::BLOCK;
 
 /// # Safety
 /// The processor has the features; arguments are as [`super::best_candidates`] checks.
-#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512vpopcntdq")]
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512vpopcntdq,avx512vbmi2")]
 pub(super) unsafe fn search(
     left: &[u64],
     right: &[u64],
@@ -23,15 +23,16 @@ pub(super) unsafe fn search(
         }
         let mut b = [_mm512_set1_epi64(i64::from(u32::MAX)); 4];
         let from = origin + at;
-        for (c, &shift) in shifts.iter().enumerate() {
+        for &shift in shifts {
             // SAFETY: the candidate lies inside for the whole block.
             let r = unsafe { right.as_ptr().offset(from as isize - shift as isize) };
-            let index = _mm512_set1_epi64(c as i64);
+            // In the upper 16 bits, from where a double shift brings it below the distance.
+            let index = _mm512_set1_epi64(i64::from(shift - shifts[0]) << 48);
             for k in 0..4 {
                 // SAFETY: as above.
                 let r = unsafe { _mm512_loadu_si512(r.add(8 * k).cast()) };
                 let bits = _mm512_popcnt_epi64(_mm512_xor_si512(l[k], r));
-                let key = _mm512_or_si512(_mm512_slli_epi64::<16>(bits), index);
+                let key = _mm512_shldi_epi64::<16>(bits, index);
                 // Keys fit 32 bits, whose minimum is cheaper.
                 b[k] = _mm512_min_epu32(b[k], key);
             }
@@ -44,4 +45,26 @@ pub(super) unsafe fn search(
             }
         }
     }
+}
+
+/// Distance << 32 | index of the row's nearest; all ones for none.
+///
+/// # Safety
+/// The processor has the features.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512vpopcntdq")]
+pub(super) unsafe fn nearest(value: u64, row: &[u64]) -> u64 {
+    let value = _mm512_set1_epi64(value as i64);
+    let mut best = _mm512_set1_epi64(-1);
+    let mut index = _mm512_setr_epi64(0, 1, 2, 3, 4, 5, 6, 7);
+    for at in (0..row.len()).step_by(8) {
+        let here = (row.len() - at).min(8);
+        let inside = 0xFF_u8 >> (8 - here);
+        // SAFETY: only values inside the row are read.
+        let other = unsafe { _mm512_maskz_loadu_epi64(inside, row.as_ptr().add(at).cast()) };
+        let bits = _mm512_popcnt_epi64(_mm512_xor_si512(value, other));
+        let key = _mm512_or_si512(_mm512_slli_epi64::<32>(bits), index);
+        best = _mm512_mask_min_epu64(best, inside, best, key);
+        index = _mm512_add_epi64(index, _mm512_set1_epi64(8));
+    }
+    _mm512_reduce_min_epu64(best)
 }

@@ -14,21 +14,55 @@ use crate::Level;
 /// Pixels a call's length is a multiple of.
 pub(crate) const BLOCK: usize = 32;
 
-/// For each `left[i]` the candidate c of smallest Hamming distance to `right[origin + i - shifts[c]]`;
-/// ties go to the first. `best[i]` = distance << 16 | c.
+/// Candidates in rising order.
+#[derive(Debug, Default)]
+pub(crate) struct Shifts(Vec<i32>);
+
+impl Shifts {
+    pub(crate) fn clear(&mut self) {
+        self.0.clear();
+    }
+
+    /// Adds a candidate.
+    ///
+    /// # Panics
+    /// When it is not above the last one.
+    pub(crate) fn push(&mut self, shift: i32) {
+        assert!(self.0.last().is_none_or(|last| *last < shift), "candidates rise");
+        self.0.push(shift);
+    }
+
+    /// The lowest candidate; 0 where there is none.
+    pub(crate) fn first(&self) -> i32 {
+        self.0.first().copied().unwrap_or(0)
+    }
+}
+
+impl Extend<i32> for Shifts {
+    fn extend<I: IntoIterator<Item = i32>>(&mut self, shifts: I) {
+        shifts.into_iter().for_each(|shift| self.push(shift));
+    }
+}
+
+/// For each `left[i]` the candidate of smallest Hamming distance to `right[origin + i - candidate]`;
+/// ties go to the lowest. `best[i]` = distance << 16 | candidate - lowest candidate, all ones without
+/// candidates.
 pub(crate) fn best_candidates(
     level: Level,
     left: &[u64],
     right: &[u64],
     origin: usize,
-    shifts: &[i32],
+    shifts: &Shifts,
     best: &mut [u32],
 ) {
     let n = left.len();
-    assert!(n.is_multiple_of(BLOCK) && best.len() == n && shifts.len() <= 1 << 16);
-    for &shift in shifts {
-        let first = origin as i64 - i64::from(shift);
-        assert!(first >= 0 && first as usize + n <= right.len(), "candidate outside the row");
+    assert!(n.is_multiple_of(BLOCK) && best.len() == n);
+    let shifts = &shifts.0[..];
+    if let [first, .., last] | [first @ last] = shifts {
+        // They rise: what holds for the outermost holds for all.
+        let at = |shift: i32| origin as i64 - i64::from(shift);
+        let inside = at(*last) >= 0 && at(*first) as usize + n <= right.len();
+        assert!(inside && i64::from(*last) - i64::from(*first) < 1 << 16, "candidates outside");
     }
     match level {
         // SAFETY: trusted levels are the processor's; every candidate lies inside as checked.
@@ -44,6 +78,20 @@ pub(crate) fn best_candidates(
     }
 }
 
+/// The smallest Hamming distance of `value` to any of `row`, and where; the first of equals.
+pub(crate) fn nearest(level: Level, value: u64, row: &[u64]) -> Option<(u32, usize)> {
+    let key = match level {
+        // SAFETY: trusted levels are the processor's.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => unsafe { avx512::nearest(value, row) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 => unsafe { avx2::nearest(value, row) },
+        _ => scalar::nearest(value, row),
+    };
+    (!row.is_empty()).then_some(((key >> 32) as u32, key as u32 as usize))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -57,15 +105,46 @@ mod tests {
             let left: Vec<u64> =
                 (0..n).map(|i| right[i + 100] ^ (1 << (random.bits() % 64))).collect();
             for count in [0usize, 1, 2, 7, 130] {
-                let shifts: Vec<i32> =
-                    (0..count).map(|_| (random.bits() % 300) as i32 - 100).collect();
+                let mut shifts = Shifts::default();
+                let mut at = -100;
+                shifts.extend((0..count).map(|_| {
+                    at += 1 + (random.bits() % 2) as i32;
+                    at
+                }));
                 let mut want = vec![9; n];
-                scalar::search(&left, &right, 250, &shifts, &mut want);
+                scalar::search(&left, &right, 250, &shifts.0, &mut want);
                 for level in Level::available() {
                     let mut got = vec![9; n];
                     best_candidates(level, &left, &right, 250, &shifts, &mut got);
                     assert_eq!(got, want, "{level} {n} {count}");
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn the_key_names_the_best_candidate() {
+        let mut random = Random::new(3);
+        let right: Vec<u64> = (0..400).map(|_| random.bits()).collect();
+        let mut shifts = Shifts::default();
+        shifts.extend([-31, -30, -4, 0, 7, 8, 90]);
+        let left: Vec<u64> = (0..64).map(|i| right[100 + i - 7]).collect();
+        let mut best = vec![0; 64];
+        best_candidates(Level::best(), &left, &right, 100, &shifts, &mut best);
+        assert!(best.iter().all(|b| *b == 38), "{best:?}");
+    }
+
+    #[test]
+    fn the_nearest_is_the_first_of_the_smallest_distance_at_every_level() {
+        let mut random = Random::new(5);
+        for n in [0usize, 1, 7, 8, 9, 64, 101] {
+            let value = random.bits();
+            let row: Vec<u64> =
+                (0..n).map(|_| value ^ (random.bits() & random.bits() & random.bits())).collect();
+            let distances = row.iter().map(|r| (r ^ value).count_ones());
+            let want = distances.enumerate().map(|(i, d)| (d, i)).min();
+            for level in Level::available() {
+                assert_eq!(nearest(level, value, &row), want, "{level} {n}");
             }
         }
     }

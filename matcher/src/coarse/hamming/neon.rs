@@ -16,7 +16,7 @@ pub(super) unsafe fn search(
         // SAFETY: `at + 4` lies within `left`.
         let l = unsafe { [vld1q_u64(left.as_ptr().add(at)), vld1q_u64(left.as_ptr().add(at + 2))] };
         let mut b = vdupq_n_u32(u32::MAX);
-        for (c, &shift) in shifts.iter().enumerate() {
+        for &shift in shifts {
             // SAFETY: the candidate lies inside for the whole block.
             let bits = unsafe {
                 let r = right.as_ptr().offset((origin + at) as isize - shift as isize);
@@ -29,7 +29,7 @@ pub(super) unsafe fn search(
                     vmovn_u64(count(l[1], vld1q_u64(r.add(2)))),
                 )
             };
-            let key = vorrq_u32(vshlq_n_u32::<16>(bits), vdupq_n_u32(c as u32));
+            let key = vorrq_u32(vshlq_n_u32::<16>(bits), vdupq_n_u32((shift - shifts[0]) as u32));
             b = vminq_u32(b, key);
         }
         // SAFETY: `at + 4` lies within `best`.

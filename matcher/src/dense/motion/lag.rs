@@ -9,6 +9,7 @@ use crate::{
     dense::moments::{PAD, box_sum},
     dense::tile::image_rows,
     lanes::vectorised,
+    params::RADIUS_LIMIT,
 };
 
 /// Rows of squared gradients around a row of blocks.
@@ -67,10 +68,11 @@ impl Lag {
     ) {
         let len = w.len();
         for (k, window) in self.windows.iter_mut().enumerate() {
-            let around = self.rows[y - top..=y - top + 2 * radius].iter();
-            let around: Vec<&[f32]> = around.map(|sums| &sums[k][..]).collect();
+            let side = 2 * radius + 1;
+            let around: [&[f32]; 2 * RADIUS_LIMIT + 1] =
+                std::array::from_fn(|j| &self.rows[y - top + j.min(side - 1)][k][..]);
             let scratch = (&mut self.column[..], &mut self.threes[..]);
-            box_sum(frame.level, &around, radius, len, scratch, window);
+            box_sum(frame.level, &around[..side], radius, len, scratch, window);
         }
         let [s, st] = &self.windows;
         let times = s[PAD..].iter().zip(&st[PAD..]);

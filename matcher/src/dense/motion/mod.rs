@@ -24,6 +24,7 @@
 mod lag;
 mod rates;
 mod sums;
+mod weight;
 
 use super::{DenseFit, DenseMaps, warp::moving};
 use crate::{Image, Level, ShapeFunction, StereoStack};
@@ -149,6 +150,11 @@ pub struct MotionFit {
     rates: Rates,
     motion: Motion,
     start: Image<f32>,
+    /// The rate that was found last.
+    found: Image<f32>,
+    /// Whether anything moved then.
+    moves: bool,
+    moving: Image<bool>,
 }
 
 impl MotionFit {
@@ -161,6 +167,9 @@ impl MotionFit {
             rates: Rates::default(),
             motion: Motion { rate, offsets: [0.0; 16], frames: 0 },
             start: Image::new(0, 0, f32::NAN),
+            found: Image::new(0, 0, 0.0),
+            moves: false,
+            moving: Image::new(0, 0, false),
         }
     }
 
@@ -175,12 +184,14 @@ impl MotionFit {
         start: &Image<f32>,
         step: &Image<u8>,
         maps: &mut DenseMaps,
-    ) -> Option<Image<f32>> {
+    ) -> Option<&Image<f32>> {
+        self.moves = false;
         let times = Times::of(stack)?;
         let (width, height) = (stack.width(), stack.height());
         if (self.start.width(), self.start.height()) != (width, height) {
             self.start = Image::new(width, height, f32::NAN);
             self.motion.rate = Image::new(width, height, 0.0);
+            self.found = Image::new(width, height, 0.0);
         }
         self.motion.frames = times.frames;
         self.motion.offsets = std::array::from_fn(|k| times.centred[k] * times.unit);
@@ -203,15 +214,15 @@ impl MotionFit {
         self.rates.expand(&self.blocks, &maps.first_px, &mut self.motion.rate);
         self.motion.offsets = times.to_newest;
         self.begin(start, maps, &times);
-        fit.refit(stack, &self.start, step, Some(&self.motion), &self.rates.moving(), maps);
+        self.rates.moving(&mut self.moving);
+        fit.refit(stack, &self.start, step, Some(&self.motion), &self.moving, maps);
 
         let best = if both { &maps.second_px } else { &maps.first_px };
         self.blocks.sum(&frame.of(best, &maps.zncc, None), Some(&self.motion));
         self.rates.add(&self.blocks, &times);
         // The fit stands for the frames' mean, whatever rate it was made with.
-        let mut last = Image::new(width, height, 0.0);
-        self.rates.expand(&self.blocks, &maps.first_px, &mut last);
-        let rates = last.as_mut_slice().iter_mut().zip(self.motion.rate.as_slice());
+        self.rates.expand(&self.blocks, &maps.first_px, &mut self.found);
+        let rates = self.found.as_mut_slice().iter_mut().zip(self.motion.rate.as_slice());
         let fits = maps.first_px.as_mut_slice().iter_mut().zip(maps.second_px.as_mut_slice());
         let scale = times.interval_s.map_or(1.0, |s| (1.0 / s) as f32);
         for ((rate, before), (first, second)) in rates.zip(fits) {
@@ -220,7 +231,13 @@ impl MotionFit {
             *second += shift;
             *rate *= scale;
         }
-        Some(last)
+        self.moves = true;
+        self.found()
+    }
+
+    /// What the last [`MotionFit::run`] gave.
+    pub fn found(&self) -> Option<&Image<f32>> {
+        self.moves.then_some(&self.found)
     }
 
     /// The start of the second fit, at the newest frame's time.

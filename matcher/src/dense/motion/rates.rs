@@ -90,8 +90,10 @@ impl Rates {
     }
 
     /// Which blocks' pixels may move: those with a rate, and around them.
-    pub fn moving(&self) -> Image<bool> {
-        let mut moving = Image::new(self.columns, self.rows, false);
+    pub fn moving(&self, moving: &mut Image<bool>) {
+        if (moving.width(), moving.height()) != (self.columns, self.rows) {
+            *moving = Image::new(self.columns, self.rows, false);
+        }
         for row in 0..self.rows {
             for column in 0..self.columns {
                 let near = neighbours((column, row), (self.columns, self.rows), 1);
@@ -99,7 +101,6 @@ impl Rates {
                 moving.set(column, row, near.into_iter().any(rate));
             }
         }
-        moving
     }
 
     /// Variance of noise per unit of weight: from second differences between neighbouring blocks, in

@@ -4,9 +4,13 @@ use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use super::{BLOCK, Motion, Times, lag::Lag};
+use super::{
+    BLOCK, Motion, Times,
+    lag::Lag,
+    weight::{Weighted, weigh, words},
+};
 use crate::{
-    Image, Level, StereoStack,
+    Image, Level, Sample, StereoStack,
     dense::{
         gradient::{SQUARE_UNIT, Static, static_row},
         tile::image_rows,
@@ -74,8 +78,18 @@ struct Scratch {
     at: Vec<f32>,
     terms: [Vec<f32>; TERMS],
     sums: [Vec<f32>; TERMS + 2],
+    surfaces: Surfaces,
+    /// Beside a last odd frame.
+    zero: Vec<Sample>,
     moving: moving::Scratch,
     lag: Lag,
+}
+
+/// Bounds of the disparities of each block's main surface.
+#[derive(Debug, Default)]
+struct Surfaces {
+    bounds: Vec<(f32, f32)>,
+    all: Vec<f32>,
 }
 
 /// Terms per pixel: n, l, ll, g, gg, il, i, ig, il t, i t, ig t, S, S t, S t^2; the sums also hold
@@ -129,13 +143,14 @@ impl Scratch {
         self.resize(len, frames.div_ceil(2));
         let end = (top + BLOCK).min(height);
         let sampled = (top..end).filter(|y| y % ROWS_APART == ROWS_APART / 2);
-        let surfaces = surfaces(frame, sampled.clone(), blocks.len());
+        let mut surfaces = std::mem::take(&mut self.surfaces);
+        bound(frame, sampled.clone(), blocks.len(), &mut surfaces);
         let smear = motion.zip(frame.smeared);
         if let Some((_, radius)) = smear {
             self.lag.fill(frame, (top, end), radius);
         }
         for y in sampled {
-            self.select(frame, y, &surfaces);
+            self.select(frame, y, &surfaces.bounds);
             if let Some((motion, radius)) = smear {
                 self.lag.correct(frame, motion, (y, top), radius, &mut self.w);
             }
@@ -150,19 +165,18 @@ impl Scratch {
                 )
             );
         }
+        self.surfaces = surfaces;
         for (column, block) in blocks.iter_mut().enumerate() {
-            let pixels = column * BLOCK..((column + 1) * BLOCK).min(len);
-            let total = |k: usize| {
-                // Four sums side by side do not wait for each other.
-                let mut sums = [0.0f64; 4];
-                for four in self.sums[k][pixels.clone()].chunks_exact(4) {
-                    for (sum, &v) in sums.iter_mut().zip(four) {
-                        *sum += f64::from(v);
-                    }
-                }
-                sums.into_iter().sum()
-            };
-            *block = solve(std::array::from_fn(total), frames);
+            let mut totals = [0.0; TERMS + 2];
+            vectorised!(
+                frame.level,
+                total_loop(
+                    sums: &[Vec<f32>; TERMS + 2] = &self.sums,
+                    from: usize = column * BLOCK,
+                    totals: &mut [f64; TERMS + 2] = &mut totals,
+                )
+            );
+            *block = solve(totals, frames);
         }
     }
 
@@ -185,31 +199,19 @@ impl Scratch {
         let stack = frame.stack;
         let frames = stack.frames();
         let len = self.w.len();
-        let mut zero = Vec::new();
-        if frames % 2 == 1 {
-            zero.resize(stack.width(), 0);
-        }
+        self.zero.resize(stack.width(), 0);
         let (mut left, mut right) =
             (image_rows(stack.left, y as isize), image_rows(stack.right, y as isize));
         let even = frames.next_multiple_of(2);
         if frames % 2 == 1 {
-            (left[frames], right[frames]) = (&zero, &zero);
+            (left[frames], right[frames]) = (&self.zero, &self.zero);
         }
         let [n, l, ll, g, gg, il, i, ig, ilt, it, igt, s, st, stt] = &mut self.terms;
         let (gradient, grey) = (&mut self.gradient[..], &mut self.grey[..]);
         let mut out = Static { gradient, grey, stride: len, s, il, i, l, ll };
         static_row(frame.level, &left[..even], 0, len, &mut out);
-        let weighted = &mut self.weighted;
-        vectorised!(
-            frame.level,
-            time_loop(
-                gradient: &[i32] = &self.gradient,
-                grey: &[i32] = &self.grey,
-                times: &[f32; 16] = &frame.times.centred,
-                weighted: &mut [i32] = weighted,
-                sums: [&mut [f32]; 4] = [ilt, it, st, stt],
-            )
-        );
+        let mut out = Weighted { gradient: &mut self.weighted, ilt, it, st, stt };
+        weigh(frame.level, &self.gradient, &self.grey, &words(&frame.times.centred), &mut out);
         // The warp sums products with two stacks: the gradients weighted by time, and plain ones.
         let (gradient, grey) = (&self.weighted[..], &self.gradient[..]);
         let source =
@@ -262,27 +264,28 @@ fn bounds_loop(row: &[f32], bounds: &mut [(f32, f32)]) {
     }
 }
 
-/// Bounds of the disparities of each block's main surface.
-fn surfaces(
+/// Finds the bounds of each block's main surface from `rows`.
+fn bound(
     frame: &Frame<'_>,
-    rows: impl Iterator<Item = usize>,
+    rows: impl Iterator<Item = usize> + Clone,
     blocks: usize,
-) -> Vec<(f32, f32)> {
-    let mut bounds = vec![(f32::INFINITY, f32::NEG_INFINITY); blocks];
-    let rows: Vec<&[f32]> = rows.map(|y| frame.disparity_px.row(y)).collect();
-    for row in &rows {
+    Surfaces { bounds, all }: &mut Surfaces,
+) {
+    bounds.clear();
+    bounds.resize(blocks, (f32::INFINITY, f32::NEG_INFINITY));
+    let rows = rows.map(|y| frame.disparity_px.row(y));
+    for row in rows.clone() {
         vectorised!(
             frame.level,
-            bounds_loop(row: &[f32] = row, bounds: &mut [(f32, f32)] = &mut bounds)
+            bounds_loop(row: &[f32] = row, bounds: &mut [(f32, f32)] = bounds)
         );
     }
-    let mut all = Vec::new();
     for (column, (low, high)) in bounds.iter_mut().enumerate() {
         if *high - *low <= SPREAD_PX {
             continue;
         }
         all.clear();
-        for row in &rows {
+        for row in rows.clone() {
             let end = ((column + 1) * BLOCK).min(row.len());
             all.extend(row[column * BLOCK..end].iter().filter(|d| !d.is_nan()));
         }
@@ -292,41 +295,6 @@ fn surfaces(
         let middle = all.len() / 2;
         let (_, median, _) = all.select_nth_unstable_by(middle, f32::total_cmp);
         (*low, *high) = (*median - SPREAD_PX, *median + SPREAD_PX);
-    }
-    bounds
-}
-
-/// Gradients weighted by the frame's time, rounded; with them i l t, i t, S t, S t^2.
-#[inline(always)]
-fn time_loop(
-    gradient: &[i32],
-    grey: &[i32],
-    times: &[f32; 16],
-    weighted: &mut [i32],
-    sums: [&mut [f32]; 4],
-) {
-    let [ilt, it, st, stt] = sums;
-    let len = ilt.len();
-    let (it, st, stt) = (&mut it[..len], &mut st[..len], &mut stt[..len]);
-    for sum in [&mut *ilt, &mut *it, &mut *st, &mut *stt] {
-        sum.fill(0.0);
-    }
-    let pairs = gradient.chunks_exact(len).zip(grey.chunks_exact(len));
-    for (pair, ((gradient, grey), weighted)) in
-        pairs.zip(weighted.chunks_exact_mut(len)).enumerate()
-    {
-        let (even, odd) = (times[2 * pair], times[2 * pair + 1]);
-        for x in 0..len {
-            let (g0, g1) = (((gradient[x] << 16) >> 16) as f32, (gradient[x] >> 16) as f32);
-            let (l0, l1) = (((grey[x] << 16) >> 16) as f32, (grey[x] >> 16) as f32);
-            // Times are -1..=1: the rounded products fit their halves.
-            let (t0, t1) = ((g0 * even).round_ties_even(), (g1 * odd).round_ties_even());
-            weighted[x] = (t0 as i32 & 0xFFFF) | ((t1 as i32) << 16);
-            ilt[x] += t0 * l0 + t1 * l1;
-            it[x] += t0 + t1;
-            st[x] += t0 * g0 + t1 * g1;
-            stt[x] += t0 * g0 * even + t1 * g1 * odd;
-        }
     }
 }
 
@@ -349,6 +317,18 @@ fn add_loop(terms: &[Vec<f32>; TERMS], w: &[f32], sums: &mut [Vec<f32>; TERMS + 
         // False for NaN: such pixels count as level.
         let good = slope.abs() < SLOPE_MAX && valid > 0.5;
         *to += if good { slope } else { 0.0 };
+    }
+}
+
+/// Each term's sum over the pixels of a block from column `from`.
+#[inline(always)]
+fn total_loop(sums: &[Vec<f32>; TERMS + 2], from: usize, totals: &mut [f64; TERMS + 2]) {
+    for (total, sum) in totals.iter_mut().zip(sums) {
+        // Rows are a multiple of the block long. Eight sums side by side do not wait for each other.
+        let Some(pixels) = sum[from..].first_chunk::<BLOCK>() else { continue };
+        let eight: [f64; 8] =
+            std::array::from_fn(|i| f64::from(pixels[i]) + f64::from(pixels[i + 8]));
+        *total = eight.into_iter().sum();
     }
 }
 
