@@ -168,6 +168,12 @@ impl Rig {
         self.cameras[index(camera)].lost
     }
 
+    /// Exposures of a camera since it was started.
+    #[must_use]
+    pub fn frames_made(&self, camera: Camera) -> u32 {
+        self.cameras[index(camera)].sequence
+    }
+
     /// Takes the oldest exposure of a camera that is read out.
     pub fn take_ready(&mut self, camera: Camera) -> Option<Exposure> {
         let now_ns = self.now_ns();

@@ -1,5 +1,6 @@
 //! Depth of a recording: choose the window, rectify, match, reproject.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 
 use stspp_matcher::{
@@ -106,6 +107,10 @@ fn choose_window(recording: &Recording, options: &Options) -> Result<Window, Rec
         let expected = "at least one pair lit by projectors".into();
         return error(expected, format!("none from pair {} on", options.first));
     }
+    let usable = match labels {
+        Some(labels) => from_whole_cycle(usable, labels, options.frames),
+        None => usable,
+    };
     // A slot that comes again ends the window: the timing's period.
     let period = labels.map_or(usable.len(), |labels| {
         let slot = |n: usize| labels[usable[n]].slot;
@@ -129,6 +134,22 @@ fn choose_window(recording: &Recording, options: &Options) -> Result<Window, Rec
     let pairs = usable[..count].to_vec();
     let labels = labels.map_or_else(Vec::new, |l| pairs.iter().map(|&k| l[k]).collect());
     Ok(Window { pairs, labels, floodlit })
+}
+
+/// Pairs from the first one on from which a window is whole: all slots of the recording, or `frames` of
+/// them, without a lost pair in between. All of them where there is no such window: then what there is of
+/// a cycle has to do.
+fn from_whole_cycle(usable: Vec<usize>, labels: &[SlotLabel], frames: Option<usize>) -> Vec<usize> {
+    let slots: BTreeSet<u16> = usable.iter().map(|&k| labels[k].slot).collect();
+    let length = frames.unwrap_or(slots.len()).max(1);
+    let is_whole = |pairs: &[usize]| {
+        let (first, last) = (pairs[0], pairs[length - 1]);
+        labels[last].sequence - labels[first].sequence == (last - first) as u32
+    };
+    match usable.windows(length).position(is_whole) {
+        Some(from) => usable[from..].to_vec(),
+        None => usable,
+    }
 }
 
 /// Runs of consecutive numbers.

@@ -8,19 +8,12 @@ use stspp_hil_sim::device::Controller;
 use stspp_hil_sim::front::bench::Bench;
 use stspp_hil_sim::front::eyes::FrameFault;
 use stspp_hil_sim::front::plug::Cable;
+use stspp_hil_sim::rig::CAMERAS;
 use stspp_protocol::usb;
 
 const HELP: &str = "unplug control|left|right, plug control|left|right, \
                     halt requests|replies|events, fault left|right lost|duplicated|lagging|short, interlock open|closed, \
                     hang, reset, status";
-
-/// The controller's inputs.
-pub enum Chip {
-    /// The emulated chip.
-    Emulated(SharedController),
-    /// The firmware's logic in process.
-    InProcess(Arc<Bench>),
-}
 
 /// Faults to come of one camera.
 type Faults = Arc<Mutex<Vec<FrameFault>>>;
@@ -29,13 +22,20 @@ type Faults = Arc<Mutex<Vec<FrameFault>>>;
 pub struct Console {
     cables: [Cable; 3],
     faults: Vec<Faults>,
-    chip: Chip,
+    bench: Arc<Bench>,
+    chip: Option<SharedController>,
 }
 
 impl Console {
-    /// Of the cables of control, left and right, and both cameras' faults.
-    pub fn new(cables: [Cable; 3], faults: Vec<Faults>, chip: Chip) -> Self {
-        Self { cables, faults, chip }
+    /// Of the cables of control, left and right, both cameras' faults, the sensor, and its emulated chip
+    /// unless the firmware's logic runs without one.
+    pub fn new(
+        cables: [Cable; 3],
+        faults: Vec<Faults>,
+        bench: Arc<Bench>,
+        chip: Option<SharedController>,
+    ) -> Self {
+        Self { cables, faults, bench, chip }
     }
 
     /// Carries out a command; says what came of it, `ok` first when it was one.
@@ -91,29 +91,30 @@ impl Console {
 
     fn with_controller(&self, act: impl FnOnce(&mut dyn Controller)) -> Option<()> {
         match &self.chip {
-            Chip::Emulated(shared) => act(&mut shared.clone()),
-            Chip::InProcess(bench) => act(bench.rig().controller()),
+            Some(shared) => act(&mut shared.clone()),
+            None => act(self.bench.rig().controller()),
         }
         Some(())
     }
 
     /// Only a chip can hang or be reset by its pin.
     fn with_chip(&self, act: impl FnOnce(&mut stspp_hil_mcu::chip::Chip)) -> Option<()> {
-        match &self.chip {
-            Chip::Emulated(shared) => {
-                act(shared.lock().chip());
-                Some(())
-            }
-            Chip::InProcess(_) => None,
-        }
+        act(self.chip.as_ref()?.lock().chip());
+        Some(())
     }
 
+    /// Light, cables, the sensor's time, and for each camera its exposures since it was started and how
+    /// many of them the host did not fetch in time.
     fn status(&self) -> String {
         let lit = match &self.chip {
-            Chip::Emulated(shared) => shared.lock().light_is_on(),
-            Chip::InProcess(bench) => !bench.rig().lit().is_empty(),
+            Some(shared) => shared.lock().light_is_on(),
+            None => !self.bench.rig().lit().is_empty(),
         };
         let plugged: Vec<bool> = self.cables.iter().map(Cable::is_plugged).collect();
-        format!("lit={lit} plugged={plugged:?}")
+        let rig = self.bench.rig();
+        let time_ms = rig.now_ns() / 1_000_000;
+        let [left, right] = CAMERAS
+            .map(|camera| format!("{}-{}", rig.frames_made(camera), rig.frames_lost(camera)));
+        format!("lit={lit} plugged={plugged:?} time_ms={time_ms} left={left} right={right}")
     }
 }

@@ -20,7 +20,7 @@ use stspp_hil_sim::world::{Camera, LightInterval, LightSource, SceneSpec, Sensor
 use stspp_protocol::timing::ProjectionTiming;
 use stspp_protocol::usb as ids;
 
-use crate::console::{Chip, Console};
+use crate::console::Console;
 use crate::pace::{self, Backlog};
 use crate::{Mcu, Simulated};
 
@@ -127,13 +127,13 @@ impl Sensor {
                     ((frame + modulus - ago_ms % modulus) % modulus) as u16
                 }));
                 let port = Plugged::new(port, cables[0].clone());
-                (Arc::new(bench), Chip::Emulated(shared), Arc::new(Mutex::new(port)))
+                (Arc::new(bench), Some(shared), Arc::new(Mutex::new(port)))
             }
             Control::InProcess(device, serial) => {
                 let bench = Arc::new(Bench::following(rig(device), self.clock));
                 let function = ControlFunction::new(Arc::clone(&bench), &serial);
                 let port = Plugged::new(function, cables[0].clone());
-                (Arc::clone(&bench), Chip::InProcess(bench), Arc::new(Mutex::new(port)))
+                (bench, None, Arc::new(Mutex::new(port)))
             }
         };
         let mut exports = vec![Export::new(control)];
@@ -146,7 +146,7 @@ impl Sensor {
                 Arc::new(Mutex::new(Plugged::new(device, cable.clone())));
             exports.push(Export::new(port));
         }
-        (Server::new(exports), Console::new(cables, faults, chip))
+        (Server::new(exports), Console::new(cables, faults, bench, chip))
     }
 }
 

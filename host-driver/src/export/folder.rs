@@ -131,7 +131,7 @@ impl OutputFolder {
         Ok(())
     }
 
-    /// Adds the file `name` (with `/` for folders in it), written by `fill`.
+    /// Adds the file `name` (with `/` for folders in it), written by `fill`; again, and it is replaced.
     ///
     /// # Errors
     /// From `fill` or the file system; [`OutputError::Exists`].
@@ -145,6 +145,7 @@ impl OutputFolder {
             return Err(OutputError::Exists { path: shown });
         }
         let staged = self.stage.join(name);
+        let again = staged.exists();
         let written = || -> io::Result<()> {
             if let Some(parent) = staged.parent() {
                 fs::create_dir_all(parent)?;
@@ -155,7 +156,9 @@ impl OutputFolder {
             out.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()
         };
         written().map_err(|source| OutputError::Write { path: shown, source })?;
-        self.files.push(PathBuf::from(name));
+        if !again {
+            self.files.push(PathBuf::from(name));
+        }
         Ok(())
     }
 

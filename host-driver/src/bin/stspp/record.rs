@@ -23,7 +23,7 @@ pub struct Args {
     folder: PathBuf,
     #[command(flatten)]
     source: Source,
-    /// Pairs to record [default: one slot cycle].
+    /// Pairs to record [default: one slot cycle, begun anew where a pair is lost].
     #[arg(long, short = 'n', value_name = "N")]
     count: Option<usize>,
     /// Write the truth beside it (sim: only): truth/depth.tiff and truth/visible_to_both.png for the
@@ -33,6 +33,36 @@ pub struct Args {
     /// Replace a recording that is there.
     #[arg(long)]
     force: bool,
+}
+
+/// How often a slot cycle with a lost pair is begun anew before it is kept as it is.
+const RESTARTS: u32 = 20;
+
+/// Labels of the pairs that were recorded.
+struct Taken {
+    labels: Vec<SlotLabel>,
+    /// Pairs lost in between.
+    lost: u32,
+    /// Times that a cycle was begun anew.
+    restarts: u32,
+    /// A cycle with a lost pair is begun anew.
+    wants_whole_cycle: bool,
+}
+
+impl Taken {
+    /// Takes the next pair; its place in the recording.
+    fn place(&mut self, label: SlotLabel) -> usize {
+        let next = self.labels.last().map_or(label.sequence, |last| last.sequence.wrapping_add(1));
+        let lost = label.sequence.saturating_sub(next);
+        if lost > 0 && self.wants_whole_cycle && self.restarts < RESTARTS {
+            self.restarts += 1;
+            self.labels.clear();
+        } else {
+            self.lost += lost;
+        }
+        self.labels.push(label);
+        self.labels.len() - 1
+    }
 }
 
 /// Runs the verb.
@@ -58,27 +88,28 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     interrupt::stops(stream.stop_handle());
     let digits = (count - 1).to_string().len().max(2);
     let progress = output.progress(count as u64, "recording");
-    let mut recorded: Vec<SlotLabel> = Vec::new();
+    // What is asked for by number, or played from a recording, is taken as it comes.
+    let wants_whole_cycle = args.count.is_none() && sensor.recording().is_none();
+    let mut taken = Taken { labels: Vec::new(), lost: 0, restarts: 0, wants_whole_cycle };
     let mut bits = 8;
-    while recorded.len() < count {
+    while taken.labels.len() < count {
         let Some(pair) = stream.next() else {
             interrupt::check()?;
-            let what = format!("the source ended after {} of {count} pairs", recorded.len());
+            let what = format!("the source ended after {} of {count} pairs", taken.labels.len());
             return Err(Failure::new(Kind::Input, what));
         };
         let pair = pair.map_err(|e| failure(&e))?;
         interrupt::check()?;
-        let index = recorded.len();
+        let index = taken.place(pair.label);
         for (side, image) in [("left", &pair.left), ("right", &pair.right)] {
             let name = format!("{side}/{index:0digits$}.png");
             out.file(&name, |w| image_io::write_raw(w, image)).map_err(|e| output_failure(&e))?;
         }
         bits = pair.left.bits.max(8);
-        recorded.push(pair.label);
-        progress.inc(1);
+        progress.set_position(index as u64 + 1);
     }
-    let stats = stream.stats();
-    drop(stream);
+    let stats = stream.finish();
+    let Taken { labels: recorded, lost, restarts, .. } = taken;
     let text = labels::to_text(&FramesInfo { bits: Some(bits), labels: recorded.clone() });
     out.file("frames.json", |w| w.write_all(text.as_bytes())).map_err(|e| output_failure(&e))?;
     if args.truth {
@@ -89,12 +120,15 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     progress.finish_and_clear();
     let folder: &Path = &args.folder;
     let text = format!(
-        "{} pairs in {}\nnext: stspp reconstruct {} --out OUT",
+        "{} pairs in {}{}\nnext: stspp reconstruct {} --out OUT",
         recorded.len(),
         folder.display(),
+        if lost > 0 { format!("; {lost} were lost in between") } else { String::new() },
         folder.display()
     );
-    output.result(&text, &json!({ "folder": folder, "pairs": recorded.len(), "stream": stats }));
+    output.result(&text, &json!({
+        "folder": folder, "pairs": recorded.len(), "lost": lost, "restarts": restarts, "stream": stats,
+    }));
     Ok(())
 }
 
@@ -185,4 +219,43 @@ fn truth(
     _source: &str,
 ) -> Result<(), Failure> {
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn places(sequences: &[u32], wants_whole_cycle: bool) -> (Vec<usize>, Taken) {
+        let mut taken = Taken { labels: Vec::new(), lost: 0, restarts: 0, wants_whole_cycle };
+        let label = |sequence| SlotLabel {
+            sequence,
+            slot: 0,
+            projector_mask: 1,
+            floodlight: false,
+            trigger_time_us: 0,
+            exposure_us: 0,
+        };
+        (sequences.iter().map(|&sequence| taken.place(label(sequence))).collect(), taken)
+    }
+
+    #[test]
+    fn a_cycle_begins_anew_where_a_pair_was_lost() {
+        let (places, taken) = places(&[4, 5, 7, 8, 9], true);
+        assert_eq!(places, [0, 1, 0, 1, 2]);
+        assert_eq!((taken.labels[0].sequence, taken.restarts, taken.lost), (7, 1, 0));
+    }
+
+    #[test]
+    fn a_number_of_pairs_is_recorded_as_they_come() {
+        let (places, taken) = places(&[4, 5, 7, 10], false);
+        assert_eq!(places, [0, 1, 2, 3]);
+        assert_eq!((taken.restarts, taken.lost), (0, 3));
+    }
+
+    #[test]
+    fn a_source_that_never_delivers_a_whole_cycle_is_recorded_all_the_same() {
+        let every_second: Vec<u32> = (0..60).map(|k| 2 * k).collect();
+        let (_, taken) = places(&every_second, true);
+        assert_eq!((taken.restarts, taken.labels.len()), (RESTARTS, 60 - RESTARTS as usize));
+    }
 }

@@ -15,6 +15,7 @@ pub mod pixels;
 pub mod topology;
 
 use super::{CameraError, CameraFrame, CameraSource, fingerprint};
+use crate::RawImage;
 use crate::clock::Clock;
 use crate::sync::{FrameStamp, Side};
 use ioctl::PixelLayout;
@@ -71,8 +72,11 @@ struct Stream {
     clock_hz: u32,
     /// Times of pictures by sequence number.
     times: VecDeque<(u32, HeaderTimes)>,
-    pictures: VecDeque<Dequeued>,
+    pictures: VecDeque<Dequeued<Images>>,
 }
+
+/// One image for each side that a picture holds; `None` where the picture is too short.
+type Images = Vec<Option<RawImage>>;
 
 /// Cameras as a source of frames.
 pub struct V4l2Cameras {
@@ -113,14 +117,14 @@ impl V4l2Cameras {
             let side = stream.sides[0];
             stream.fetch().map_err(|e| gone_or_io(side, e))?;
             while let Some((picture, timestamp_camera_ns, usb_sof)) = stream.complete() {
-                let frames = stream.frames(&picture);
-                if picture.is_damaged || frames.iter().any(Option::is_none) {
+                if picture.is_damaged || picture.content.iter().any(Option::is_none) {
                     for side in &stream.sides {
                         self.damaged[side.index()] += 1;
                     }
                     continue;
                 }
-                for (side, image) in stream.sides.iter().zip(frames.into_iter().flatten()) {
+                let images = picture.content.into_iter().flatten();
+                for (side, image) in stream.sides.iter().zip(images) {
                     let stamp = FrameStamp {
                         side: *side,
                         sequence: picture.sequence,
@@ -284,8 +288,8 @@ impl Stream {
 
     fn fetch(&mut self) -> io::Result<()> {
         if let Some(metadata) = &mut self.metadata {
-            while let Some(buffer) = metadata.take()? {
-                if let Some(times) = metadata::parse(&buffer.bytes) {
+            while let Some(buffer) = metadata.take(metadata::parse)? {
+                if let Some(times) = buffer.content {
                     self.times.push_back((buffer.sequence, times));
                 }
             }
@@ -293,7 +297,12 @@ impl Stream {
                 self.times.pop_front();
             }
         }
-        while let Some(picture) = self.video.take()? {
+        let (format, layout, count) = (self.format, &self.layout, self.sides.len());
+        let width = layout.width as usize / count;
+        let images = |bytes: &[u8]| -> Images {
+            (0..count).map(|i| pixels::image(format, layout, bytes, i * width, width)).collect()
+        };
+        while let Some(picture) = self.video.take(images)? {
             self.pictures.push_back(picture);
         }
         Ok(())
@@ -301,7 +310,7 @@ impl Stream {
 
     /// The oldest picture with its camera time and the USB frame number of its exposure's start, once
     /// its metadata is there or will not come.
-    fn complete(&mut self) -> Option<(Dequeued, u64, Option<u16>)> {
+    fn complete(&mut self) -> Option<(Dequeued<Images>, u64, Option<u16>)> {
         let first = self.pictures.front()?;
         if self.metadata.is_none() {
             let picture = self.pictures.pop_front()?;
@@ -325,13 +334,6 @@ impl Stream {
             }
             None => None,
         }
-    }
-
-    fn frames(&self, picture: &Dequeued) -> Vec<Option<crate::RawImage>> {
-        let width = self.layout.width as usize / self.sides.len();
-        (0..self.sides.len())
-            .map(|i| pixels::image(self.format, &self.layout, &picture.bytes, i * width, width))
-            .collect()
     }
 }
 

@@ -1,6 +1,6 @@
 //! One video or metadata node: opened, configured, streaming through mapped buffers.
 
-use super::ioctl::{self, Buffer, ControlDescription, Mapping, PixelLayout};
+use super::ioctl::{self, ControlDescription, Mapping, PixelLayout};
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
@@ -27,15 +27,15 @@ impl NodeKind {
 
 /// What a buffer held.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Dequeued {
+pub struct Dequeued<T> {
     /// The driver's count of pictures since the stream's start.
     pub sequence: u32,
     /// When the driver saw the picture begin: the machine's monotonic clock, nanoseconds.
     pub timestamp_ns: u64,
     /// The driver saw that the picture is damaged.
     pub is_damaged: bool,
-    /// The bytes.
-    pub bytes: Vec<u8>,
+    /// What was made of the bytes.
+    pub content: T,
 }
 
 /// An open node; stops streaming when dropped.
@@ -156,35 +156,31 @@ impl Node {
         let _ = ioctl::request_buffers(self.fd(), kind, 0);
     }
 
-    /// Takes the next filled buffer, if there is one, copies it out and gives it back.
+    /// Takes the next filled buffer, if there is one, has `read` make something of its bytes, and gives
+    /// it back.
     ///
     /// # Errors
     /// The system's: `ENODEV` when the camera is gone.
-    pub fn take(&mut self) -> io::Result<Option<Dequeued>> {
+    pub fn take<T>(&mut self, read: impl FnOnce(&[u8]) -> T) -> io::Result<Option<Dequeued<T>>> {
         let kind = self.kind.buffer_type();
         let buffer = match ioctl::dequeue(self.fd(), kind) {
             Ok(buffer) => buffer,
             Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(None),
             Err(e) => return Err(e),
         };
-        let dequeued = self.copy(&buffer);
-        ioctl::enqueue(self.fd(), kind, buffer.index)?;
-        Ok(Some(dequeued))
-    }
-
-    fn copy(&self, buffer: &Buffer) -> Dequeued {
         let bytes = self
             .buffers
             .get(buffer.index as usize)
-            .map(|mapping| mapping.bytes(buffer.bytes_used as usize).to_vec())
-            .unwrap_or_default();
+            .map_or(&[][..], |mapping| mapping.bytes(buffer.bytes_used as usize));
         let (seconds, micros) = (buffer.timestamp_s.max(0), buffer.timestamp_us.max(0));
-        Dequeued {
+        let dequeued = Dequeued {
             sequence: buffer.sequence,
             timestamp_ns: seconds as u64 * 1_000_000_000 + micros as u64 * 1000,
             is_damaged: buffer.flags & ioctl::BUFFER_FLAG_ERROR != 0,
-            bytes,
-        }
+            content: read(bytes),
+        };
+        ioctl::enqueue(self.fd(), kind, buffer.index)?;
+        Ok(Some(dequeued))
     }
 
     /// All controls that can be used.

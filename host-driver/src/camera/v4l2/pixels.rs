@@ -75,23 +75,37 @@ pub fn image(
     {
         return None;
     }
-    let rows = (0..height).map(|y| &bytes[y * line + first_column * pixel..][..width * pixel]);
-    match format {
+    let row = |y: usize| &bytes[y * line + first_column * pixel..][..width * pixel];
+    // By rows: a picture is copied once, as fast as memory goes.
+    Some(match format {
         PixelFormat::Grey => {
-            Image::from_vec(width, height, rows.flatten().copied().collect()).map(RawImage::gray8)
+            RawImage::gray8(rows(width, height, |y, pixels| pixels.copy_from_slice(row(y))))
         }
-        PixelFormat::Yuyv => {
-            let luma = rows.flat_map(|row| row.iter().copied().step_by(2)).collect();
-            Image::from_vec(width, height, luma).map(RawImage::gray8)
-        }
+        PixelFormat::Yuyv => RawImage::gray8(rows(width, height, |y, pixels| {
+            for (luma, pair) in pixels.iter_mut().zip(row(y).chunks_exact(2)) {
+                *luma = pair[0];
+            }
+        })),
         PixelFormat::Y10 | PixelFormat::Y12 | PixelFormat::Y16 => {
-            let words = rows
-                .flat_map(|row| row.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])))
-                .collect();
-            let bits = format.bits();
-            Image::from_vec(width, height, words).map(|pixels| RawImage::gray16(pixels, bits))
+            let words = rows(width, height, |y, pixels: &mut [u16]| {
+                for (word, pair) in pixels.iter_mut().zip(row(y).chunks_exact(2)) {
+                    *word = u16::from_le_bytes([pair[0], pair[1]]);
+                }
+            });
+            RawImage::gray16(words, format.bits())
         }
-    }
+    })
+}
+
+/// An image whose rows `fill` writes.
+fn rows<T: Copy + Default>(
+    width: usize,
+    height: usize,
+    mut fill: impl FnMut(usize, &mut [T]),
+) -> Image<T> {
+    let mut image = Image::new(width, height, T::default());
+    (0..height).for_each(|y| fill(y, image.row_mut(y)));
+    image
 }
 
 #[cfg(test)]
