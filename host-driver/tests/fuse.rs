@@ -102,8 +102,8 @@ fn a_turn_is_fused_and_its_loop_closed() {
     assert!(back > 500, "{back} points on the far side");
     let rms_m = rms_off_m(&model);
     assert!(rms_m < sigma_m, "RMS {rms_m} m");
-    assert!(model.loop_closed_mm < 0.1, "{} mm", model.loop_closed_mm);
-    assert!(model.loop_open_mm.is_some());
+    assert!(model.loop_closed_mm < 0.1, "{:#?}", model.pairs);
+    assert!(model.loop_open_mm.is_some_and(|open| open < 0.1), "{:?} mm", model.loop_open_mm);
     for (k, pose) in model.first_from_view.iter().enumerate() {
         let truth = sensor_from_object(0) * sensor_from_object(k).inverse();
         let middle = sensor_from_object(k) * Point3::origin();

@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Point3};
 use stspp_matcher::{Method, ShapeFunction};
 
-use super::fig6::{distances, surface_of, surface_rms_mm};
+use super::turn::{distances, surface_of, surface_rms_mm};
 use super::{ExperimentError, Figure, Good, Row, Section, Studio, pictures};
 use crate::DepthFrame;
 use crate::accuracy::score::score;

@@ -1,6 +1,6 @@
 //! Figure 4: the statue over the number of patterns.
 
-use super::fig6::{surface_of, surface_rms_mm};
+use super::turn::{surface_of, surface_rms_mm};
 use super::{Chart, ExperimentError, Figure, Good, Row, Section, Studio, pictures};
 use crate::DepthFrame;
 use crate::accuracy::score::score;

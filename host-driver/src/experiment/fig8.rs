@@ -2,8 +2,8 @@
 
 use nalgebra::{Isometry3, Point3};
 
-use super::fig6::{distances, surface_of, surface_rms_mm};
 use super::studio::FRAMES;
+use super::turn::{distances, surface_of, surface_rms_mm};
 use super::{ExperimentError, Figure, Row, Section, Studio, pictures};
 use crate::fuse::{self, FuseParams, Start, View};
 use crate::measure::rms;

@@ -20,6 +20,7 @@ pub mod fig8;
 mod pictures;
 pub mod report;
 pub mod studio;
+mod turn;
 
 use std::path::PathBuf;
 

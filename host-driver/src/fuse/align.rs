@@ -1,76 +1,26 @@
-//! Fine poses of the views: ICP between all pairs that overlap, and a pose graph over them.
+//! Fine poses of the views: ICP between all pairs that overlap, a pose graph over them, and all poses at
+//! once.
 
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3};
 
 use super::coarse::Poses;
+use super::refine::{self, Link};
+use super::sparse::Sparse;
 use super::{FuseError, FuseParams, PairReport, View};
 use crate::register::RegisterError;
 use crate::register::icp::{self, IcpParams};
 use crate::register::pose_graph::{self, Edge};
-use crate::register::surface::{CloudSurface, Surface};
-use crate::register::thin::thinned_by;
+use crate::register::surface::Surface;
 
-/// The good points of a view, spread evenly, ready to be searched.
-pub struct Sparse {
-    /// Points in the view's own frame, metres.
-    pub points_m: Vec<Point3<f64>>,
-    surface: Option<CloudSurface>,
-}
-
-/// Farthest pairs of an ICP that starts at closed poses, metres.
+/// Farthest pairs of points once the pose graph is solved, metres.
 const FINE_M: f64 = 0.004;
 /// Points that the overlap of a pair is estimated by.
 const OVERLAP_POINTS: usize = 3000;
-
-impl Sparse {
-    /// The sparse clouds of all views.
-    ///
-    /// # Errors
-    /// A view without enough good points.
-    pub fn of_all(
-        views: &[View],
-        params: &FuseParams,
-        progress: &mut dyn FnMut(String),
-    ) -> Result<Vec<Self>, FuseError> {
-        views
-            .iter()
-            .map(|view| {
-                progress(format!("{}: spreading points", view.name));
-                Self::of(view, params).map_err(|source| FuseError::Pair {
-                    source_name: view.name.clone(),
-                    target_name: "the model".into(),
-                    source,
-                })
-            })
-            .collect()
-    }
-
-    fn of(view: &View, params: &FuseParams) -> Result<Self, RegisterError> {
-        let cos_min = params.incidence_max_deg.to_radians().cos() as f32;
-        let good: Vec<Point3<f64>> = (0..view.points_m.len())
-            .filter(|&k| view.sigma_m[k].is_finite() && view.incidence_cos[k] >= cos_min)
-            .map(|k| view.points_m[k].cast())
-            .collect();
-        let chosen = thinned_by(&good, params.icp_cell_m);
-        let points_m: Vec<_> = chosen.into_iter().map(|k| good[k]).collect();
-        // The surface is denser than the source: its normals and its points' spacing set the limit.
-        let dense = thinned_by(&good, (params.icp_cell_m / 2.0).max(params.cell_m));
-        let dense: Vec<_> = dense.into_iter().map(|k| good[k]).collect();
-        let surface = Some(CloudSurface::new(&dense)?);
-        Ok(Self { points_m, surface })
-    }
-
-    /// Middle of its points.
-    pub fn centroid(&self) -> Point3<f64> {
-        let sum = self.points_m.iter().fold(Vector3::zeros(), |s, p| s + p.coords);
-        Point3::from(sum / self.points_m.len().max(1) as f64)
-    }
-
-    #[cfg(test)]
-    pub(super) fn for_test(points_m: Vec<Point3<f64>>) -> Self {
-        Self { points_m, surface: None }
-    }
-}
+/// Without the rims, and counting only points whose normals agree, overlaps are smaller than the
+/// clouds': this share of the least one is enough for a pair that holds views together.
+const INNER_SHARE: f64 = 0.5;
+/// Points of a view that coarse ICP uses.
+const COARSE_POINTS: usize = 12_000;
 
 /// Poses with loops closed.
 pub struct Aligned {
@@ -84,18 +34,17 @@ pub struct Aligned {
     pub loop_closed_mm: f64,
 }
 
-/// A registered pair.
+/// A link and what it says alone.
 struct Pair {
-    edge: Edge,
-    centroid_m: Point3<f64>,
-    overlap: f64,
-    rms_m: f64,
+    link: Link,
+    target_from_source: Isometry3<f64>,
+    said: refine::Normal,
 }
 
 /// Fine poses, from coarse ones.
 ///
 /// # Errors
-/// [`FuseError::Pair`] for neighbours that cannot be registered, [`FuseError::Apart`].
+/// [`FuseError::Pair`] for two views that cannot be registered, [`FuseError::Apart`].
 pub fn align(
     views: &[View],
     sparse: &[Sparse],
@@ -103,71 +52,24 @@ pub fn align(
     params: &FuseParams,
     progress: &mut dyn FnMut(String),
 ) -> Result<Aligned, FuseError> {
-    let mut poses = start.first_from_view.clone();
-    let mut reach_m = start.reach_m;
-    let mut pairs = Vec::new();
-    // From coarse poses first; from closed ones then, with a gate that leaves wrong pairs no room.
-    for round in 0..2 {
-        pairs.clear();
-        for target in 0..views.len() {
-            for source in target + 1..views.len() {
-                let guess = poses[target].inverse() * poses[source];
-                let overlap = overlap(&sparse[source], &sparse[target], &guess, reach_m);
-                if overlap < params.overlap_min {
-                    continue;
-                }
-                progress(format!(
-                    "round {} of 2: {} onto {}",
-                    round + 1,
-                    views[source].name,
-                    views[target].name
-                ));
-                let found = register(&sparse[source], &sparse[target], guess, reach_m);
-                match found {
-                    Ok(found) => {
-                        if found.overlap < params.overlap_min {
-                            continue;
-                        }
-                        let edge = Edge {
-                            target,
-                            source,
-                            target_from_source: found.target_from_source,
-                            information: found.information_about_origin()
-                                / found.rms_m.max(1e-6).powi(2),
-                        };
-                        pairs.push(Pair {
-                            edge,
-                            centroid_m: found.centroid_m,
-                            overlap: found.overlap,
-                            rms_m: found.rms_m,
-                        });
-                    }
-                    // Distant pairs may slide or miss; the graph tells when a view is left alone.
-                    Err(error) if source == target + 1 && views.len() == 2 => {
-                        return Err(FuseError::Pair {
-                            source_name: views[source].name.clone(),
-                            target_name: views[target].name.clone(),
-                            source: error,
-                        });
-                    }
-                    Err(_) => {}
-                }
-            }
-        }
-        let edges: Vec<Edge> = pairs.iter().map(|p| p.edge.clone()).collect();
-        let solved = pose_graph::solve(views.len(), &edges).map_err(|error| match error {
-            RegisterError::Disconnected { view } => {
-                FuseError::Apart { name: views[view].name.clone(), needed: params.overlap_min }
-            }
-            source => FuseError::Pair {
-                source_name: "the views".into(),
-                target_name: "each other".into(),
-                source,
-            },
-        })?;
-        poses = solved.first_from_view;
-        reach_m = FINE_M;
+    let mut poses = near(views, sparse, start, params, progress)?;
+    let pairs = links(views, sparse, &poses, params, progress);
+    let links: Vec<Link> = pairs.iter().map(|p| p.link).collect();
+    if let Some(view) = apart(views.len(), &links) {
+        return Err(FuseError::Apart {
+            name: views[view].name.clone(),
+            needed: params.overlap_min,
+        });
     }
+    let failed = |source| FuseError::Pair {
+        source_name: "the views".into(),
+        target_name: "each other".into(),
+        source,
+    };
+    refine::solve(sparse, &links, &mut poses, FINE_M, &mut |round| {
+        progress(format!("all {} views at once, round {}", views.len(), round + 1));
+    })
+    .map_err(failed)?;
     let reports: Vec<PairReport> = pairs.iter().map(|p| report(p, &poses)).collect();
     Ok(Aligned {
         loop_open_mm: loop_open_mm(views.len(), &pairs, sparse),
@@ -177,27 +79,131 @@ pub fn align(
     })
 }
 
+/// Poses by ICP between all pairs that overlap and a pose graph: to the tenths of a millimetre.
+fn near(
+    views: &[View],
+    sparse: &[Sparse],
+    start: &Poses,
+    params: &FuseParams,
+    progress: &mut dyn FnMut(String),
+) -> Result<Vec<Isometry3<f64>>, FuseError> {
+    let poses = &start.first_from_view;
+    let mut edges = Vec::new();
+    for target in 0..views.len() {
+        for source in target + 1..views.len() {
+            let guess = poses[target].inverse() * poses[source];
+            let overlap = overlap(&sparse[source], &sparse[target], &guess, start.reach_m);
+            if overlap < params.overlap_min {
+                continue;
+            }
+            progress(format!("{} onto {}", views[source].name, views[target].name));
+            match register(&sparse[source], &sparse[target], guess, start.reach_m) {
+                Ok(found) if found.overlap < params.overlap_min => {}
+                Ok(found) => edges.push(Edge {
+                    target,
+                    source,
+                    target_from_source: found.target_from_source,
+                    information: found.information_about_origin() / found.rms_m.max(1e-6).powi(2),
+                }),
+                // Of many pairs, some may slide or miss; the graph tells when a view is left alone.
+                Err(error) if views.len() == 2 => {
+                    return Err(FuseError::Pair {
+                        source_name: views[source].name.clone(),
+                        target_name: views[target].name.clone(),
+                        source: error,
+                    });
+                }
+                Err(_) => {}
+            }
+        }
+    }
+    let solved = pose_graph::solve(views.len(), &edges).map_err(|error| match error {
+        RegisterError::Disconnected { view } => {
+            FuseError::Apart { name: views[view].name.clone(), needed: params.overlap_min }
+        }
+        source => FuseError::Pair {
+            source_name: "the views".into(),
+            target_name: "each other".into(),
+            source,
+        },
+    })?;
+    Ok(solved.first_from_view)
+}
+
 fn register(
     source: &Sparse,
     target: &Sparse,
     guess: Isometry3<f64>,
     reach_m: f64,
 ) -> Result<icp::IcpResult, RegisterError> {
-    let surface = target.surface.as_ref().ok_or(RegisterError::EmptyMesh)?;
+    let surface = target.surface().ok_or(RegisterError::EmptyMesh)?;
     let params = IcpParams {
         max_distance_m: reach_m,
         keep: 0.85,
         iterations_max: 30,
-        settled_rad: 1e-6,
-        settled_m: 1e-6,
+        settled_rad: 1e-5,
+        settled_m: 1e-5,
         ..IcpParams::default()
     };
-    icp::register(&source.points_m, surface, guess, &params)
+    let step = source.points_m.len().div_ceil(COARSE_POINTS).max(1);
+    let points: Vec<_> = source.points_m.iter().copied().step_by(step).collect();
+    icp::register(&points, surface, guess, &params)
+}
+
+/// Pairs of views that overlap at poses that are nearly right, each registered alone.
+fn links(
+    views: &[View],
+    sparse: &[Sparse],
+    poses: &[Isometry3<f64>],
+    params: &FuseParams,
+    progress: &mut dyn FnMut(String),
+) -> Vec<Pair> {
+    let mut pairs = Vec::new();
+    for target in 0..views.len() {
+        for source in target + 1..views.len() {
+            let link = Link { target, source };
+            let guess = poses[target].inverse() * poses[source];
+            let least = INNER_SHARE * params.overlap_min;
+            if overlap(&sparse[source], &sparse[target], &guess, FINE_M) < least {
+                continue;
+            }
+            progress(format!("{} and {} alone", views[source].name, views[target].name));
+            let found = refine::alone(sparse, link, poses, FINE_M);
+            if let Ok((target_from_source, said)) = found
+                && said.overlap >= least
+            {
+                pairs.push(Pair { link, target_from_source, said });
+            }
+        }
+    }
+    // Pairs of little overlap only where they are needed: they can slide.
+    pairs.sort_by(|a: &Pair, b: &Pair| b.said.overlap.total_cmp(&a.said.overlap));
+    let mut part: Vec<usize> = (0..views.len()).collect();
+    pairs.retain(|pair| {
+        let (target, source) = (part[pair.link.target], part[pair.link.source]);
+        part.iter_mut().filter(|p| **p == source).for_each(|p| *p = target);
+        pair.said.overlap >= params.overlap_min || target != source
+    });
+    pairs.sort_by_key(|pair| (pair.link.target, pair.link.source));
+    pairs
+}
+
+/// The first view that no links lead to from the first one.
+fn apart(views: usize, links: &[Link]) -> Option<usize> {
+    let mut reached = vec![false; views];
+    reached[0] = true;
+    for _ in 0..views {
+        for Link { target, source } in links {
+            let either = reached[*target] || reached[*source];
+            (reached[*target], reached[*source]) = (either, either);
+        }
+    }
+    reached.iter().position(|r| !r)
 }
 
 /// Share of the source's points that are near the target.
 fn overlap(source: &Sparse, target: &Sparse, guess: &Isometry3<f64>, reach_m: f64) -> f64 {
-    let Some(surface) = &target.surface else { return 0.0 };
+    let Some(surface) = target.surface() else { return 0.0 };
     let step = source.points_m.len().div_ceil(OVERLAP_POINTS).max(1);
     let near = source
         .points_m
@@ -209,15 +215,17 @@ fn overlap(source: &Sparse, target: &Sparse, guess: &Isometry3<f64>, reach_m: f6
 }
 
 fn report(pair: &Pair, poses: &[Isometry3<f64>]) -> PairReport {
-    let Edge { target, source, target_from_source, .. } = &pair.edge;
-    let closed = poses[*target].inverse() * poses[*source];
-    let in_source = target_from_source.inverse() * pair.centroid_m;
-    let off = closed * in_source - target_from_source * in_source;
+    let Link { target, source } = pair.link;
+    let closed = poses[target].inverse() * poses[source];
+    let in_target = poses[target].inverse() * pair.said.middle_m;
+    let in_source = closed.inverse() * in_target;
+    let off = closed * in_source - pair.target_from_source * in_source;
     PairReport {
-        target: *target,
-        source: *source,
-        overlap: pair.overlap,
-        rms_mm: pair.rms_m * 1e3,
+        target,
+        source,
+        overlap: pair.said.overlap,
+        target_from_source: pair.target_from_source,
+        rms_mm: pair.said.rms_m * 1e3,
         closed_mm: off.norm() * 1e3,
     }
 }
@@ -226,8 +234,8 @@ fn report(pair: &Pair, poses: &[Isometry3<f64>]) -> PairReport {
 /// `None` when the last view does not overlap the first.
 fn loop_open_mm(views: usize, pairs: &[Pair], sparse: &[Sparse]) -> Option<f64> {
     let motion = |target: usize, source: usize| {
-        let of = |p: &&Pair| p.edge.target == target && p.edge.source == source;
-        pairs.iter().find(of).map(|p| p.edge.target_from_source)
+        let link = Link { target, source };
+        pairs.iter().find(|p| p.link == link).map(|p| p.target_from_source)
     };
     if views < 3 {
         return None;
@@ -237,6 +245,6 @@ fn loop_open_mm(views: usize, pairs: &[Pair], sparse: &[Sparse]) -> Option<f64> 
         chain *= motion(source - 1, source)?;
     }
     let round = chain * motion(0, views - 1)?.inverse();
-    let middle = sparse[0].centroid();
+    let middle: Point3<f64> = sparse[0].centroid();
     Some((round * middle - middle).norm() * 1e3)
 }

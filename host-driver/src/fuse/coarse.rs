@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, UnitVector3, Vector3};
 
-use super::align::Sparse;
+use super::sparse::Sparse;
 use super::{FuseError, FuseParams, Start, View};
 use crate::register::global::{self, GlobalParams};
 

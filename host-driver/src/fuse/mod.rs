@@ -1,7 +1,9 @@
 //! Fusion: several views of a thing into one model.
 //!
 //! ```text
-//! views ─► coarse (turntable, guide, global) ─► pairwise ICP ─► pose graph (loops closed)
+//! views ─► coarse (turntable, guide, global) ─► pairwise ICP ─► robust pose graph (to 0.1 mm)
+//!                                                                    │
+//!                  sparse, without rims ─► all views at once (refine: loops closed)
 //!                                                                    │
 //!          model ◄─ layers, strays removed ◄─ weighted grid ◄────────┘
 //! ```
@@ -13,6 +15,8 @@ pub mod align;
 pub mod coarse;
 pub mod grid;
 pub mod noise;
+pub mod refine;
+pub mod sparse;
 pub mod view;
 
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -123,6 +127,9 @@ pub struct PairReport {
     pub overlap: f64,
     /// RMS of the point-to-plane distances, millimetres.
     pub rms_mm: f64,
+    /// The motion that the pair alone asks for.
+    #[serde(skip)]
+    pub target_from_source: Isometry3<f64>,
     /// How far the pair's own motion and the closed poses disagree at the overlap, millimetres.
     pub closed_mm: f64,
 }
@@ -136,10 +143,11 @@ pub struct Model {
     pub first_from_view: Vec<Isometry3<f64>>,
     /// Every registered pair.
     pub pairs: Vec<PairReport>,
-    /// How far the chain of views missed its start before the loop was closed, millimetres; `None`
-    /// without a loop.
+    /// How far the chain of neighbours, each registered alone, misses its start when it comes round, at the
+    /// object's middle, millimetres; `None` without a loop.
     pub loop_open_mm: Option<f64>,
-    /// How far any pair still disagrees after, millimetres.
+    /// How far any registered pair, alone, would still move from the poses that all views were given
+    /// together, at the middle of its overlap, millimetres.
     pub loop_closed_mm: f64,
     /// Points that went in, over all views.
     pub points_in: usize,
@@ -172,7 +180,7 @@ pub fn fuse(
     progress: &mut dyn FnMut(String),
 ) -> Result<Model, FuseError> {
     check(views, params)?;
-    let sparse = align::Sparse::of_all(views, params, progress)?;
+    let sparse = sparse::Sparse::of_all(views, params, progress)?;
     let start = coarse::poses(views, &sparse, params, progress)?;
     let aligned = align::align(views, &sparse, &start, params, progress)?;
     progress("fusing".into());

@@ -23,6 +23,8 @@ pub struct View {
     pub sigma_m: Vec<f32>,
     /// Brightness.
     pub intensity: Vec<u8>,
+    /// Distance from a point to the next one, metres (median).
+    pub spacing_m: f64,
 }
 
 /// A point whose tenth neighbour is farther than so many times the median is alone.
@@ -50,7 +52,8 @@ impl View {
             .collect();
         let mut sorted = reach.clone();
         let middle = sorted.len() / 2;
-        let limit = *sorted.select_nth_unstable_by(middle, f32::total_cmp).1 * ALONE as f32;
+        let median = *sorted.select_nth_unstable_by(middle, f32::total_cmp).1;
+        let limit = median * ALONE as f32;
         let normals = estimate_normals(&points, &tree, &Normals::default());
         let mut view = Self {
             name: name.into(),
@@ -59,6 +62,8 @@ impl View {
             incidence_cos: Vec::with_capacity(points.len()),
             sigma_m: Vec::with_capacity(points.len()),
             intensity: chosen.iter().map(|&k| cloud.intensity[k]).collect(),
+            // Of a surface, pi r^2 holds ten points when they are r / 1.78 apart.
+            spacing_m: f64::from(median) / (10.0 / std::f64::consts::PI).sqrt(),
         };
         for (((point, normal), reach), &k) in points.iter().zip(normals).zip(reach).zip(&chosen) {
             let point = Point3::from(*point);

@@ -137,7 +137,7 @@ fn iterate(
         iteration += 1;
         let pairs = pair(source, target, pose, *gate_m, params.keep)?;
         let (normal, right, centroid_m, squares) = normal_equations(&pairs);
-        check_rank(&normal, pairs.len())?;
+        check_rank(&normal)?;
         let twist = -normal.cholesky().ok_or(RegisterError::Degenerate { free: 1 })?.solve(&right);
         *pose = about(&centroid_m, &motion_of_twist(&twist)) * *pose;
         let moved_m = twist.fixed_rows::<3>(3).norm();
@@ -234,13 +234,14 @@ fn normal_equations(pairs: &[Pair]) -> (Matrix6<f64>, Vector6<f64>, Point3<f64>,
     (normal, right, Point3::from(centroid), squares)
 }
 
-/// Refuses overlaps that leave the pose free. The rotation block is scaled by the pairs' spread, so
-/// that all six eigenvalues are shares of the pairs that fix a direction.
-fn check_rank(normal: &Matrix6<f64>, pairs: usize) -> Result<(), RegisterError> {
+/// Refuses overlaps that leave the pose free, by the normal matrix of a twist about their middle. The
+/// rotation block is scaled by the pairs' spread, so that all six eigenvalues are shares of the pairs
+/// (by weight: the normals are of unit length) that fix a direction.
+pub(crate) fn check_rank(normal: &Matrix6<f64>) -> Result<(), RegisterError> {
     let turn = normal.fixed_view::<3, 3>(0, 0).trace();
     let shift = normal.fixed_view::<3, 3>(3, 3).trace();
     let scale = if turn > 0.0 { (shift / turn).sqrt() } else { 1.0 };
-    let mut scaled = *normal / pairs as f64;
+    let mut scaled = *normal / shift;
     for i in 0..3 {
         scaled.row_mut(i).scale_mut(scale);
         scaled.column_mut(i).scale_mut(scale);

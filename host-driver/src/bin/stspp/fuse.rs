@@ -123,10 +123,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     );
     text += &match model.loop_open_mm {
         Some(open) => format!(
-            "the loop was open by {open:.4} mm, closed no pair disagrees by more than {:.4} mm\n",
+            "the chain of neighbours misses its start by {open:.4} mm; with the loop closed no pair is \
+             off by more than {:.4} mm\n",
             model.loop_closed_mm
         ),
-        None => format!("no pair disagrees by more than {:.4} mm\n", model.loop_closed_mm),
+        None => format!("no pair is off by more than {:.4} mm\n", model.loop_closed_mm),
     };
     if let Some(bytes) = peak_memory_bytes() {
         text += &format!("peak memory {:.0} MiB\n", bytes as f64 / f64::from(1 << 20));
@@ -180,7 +181,8 @@ fn view(path: &Path, region: &Region, args: &Args) -> Result<View, Failure> {
         let recording = Recording::open(path).map_err(|e| failed(e.into()))?;
         let found = reconstruct::reconstruct(&recording, &args.matching.options(), &mut |_| ())
             .map_err(failed)?;
-        found.frame.point_cloud()
+        // Views of something that turns: at the middle of their windows they are most exact.
+        found.frame.at_window_middle().point_cloud()
     } else {
         PointCloud::read_ply(path).map_err(|e| input(&format!("{name}: {e}")))?
     };
