@@ -128,6 +128,21 @@ fn fast_motion_is_measured_by_fewer_frames_and_beyond_that_not_at_all() {
     }
 }
 
+/// A surface nearer than the range reaches is not there, and is not taken for one too fast to be found.
+#[test]
+fn what_is_out_of_range_does_not_cost_the_rest() {
+    let layers = vec![
+        (Layer::patch(|x, y| 40.3 + 0.03 * x - 0.02 * y, |_, y| y < 120.0), 0.0),
+        (Layer::patch(|_, _| 330.0, |_, y| y >= 120.0), 0.0),
+    ];
+    let scene = moving(layers, (480, 256)).render();
+    let range = DisparityRange { min_px: -150, max_px: 250 };
+    let found = run(&scene, Params { disparity: range, ..params(ShapeFunction::Auto) });
+    let upper = |_: usize, y: usize| y < 110;
+    let (bias, scatter, n) = errors(&found.disparity_px, truth_of(&scene), upper);
+    assert!(n > 30_000.0 && bias.abs() < 0.01 && scatter < 0.05, "{n} {bias} {scatter}");
+}
+
 #[test]
 fn at_rest_the_rate_is_zero_and_the_disparity_untouched() {
     let scene = plane(0.0).render();

@@ -51,7 +51,7 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
         View::new(name, cloud).ok_or(ExperimentError::Missing { figure: "fig8", what: missing })
     };
     let mut views = vec![view("far view".into(), &cloud)?];
-    studio.depths(DepthRange { min_m: 0.7, max_m: 1.3 });
+    studio.depths(DepthRange { min_m: 0.75, max_m: 1.3 });
     for (k, (x, y)) in NEAR.into_iter().enumerate() {
         let options = [("distance_m", "0.85"), ("x_mm", x), ("y_mm", y)];
         let take = studio.take("panel", &options, 0)?;

@@ -21,6 +21,8 @@ const BAND: usize = 64;
 const FOUND_PART: f32 = 0.85;
 /// ...and least part of all samples that must be lit for something to be lost.
 const LIT_PART: f32 = 0.02;
+/// Most px between the disparities of pixels half a [`GRID`] apart on one surface.
+const SLOPE_PX: u16 = 6;
 /// Disparities by fewer frames that are off by more px than whole pixels explain, where the rate is
 /// allowed for, and the part of them that tells that the rate is wrong.
 const OFF_PX: (f32, f32) = (0.75, 4.0);
@@ -137,7 +139,11 @@ impl Trial {
                 if now == INVALID {
                     continue;
                 }
-                again += 1;
+                // Where the surface is out of range, or out of the right image's sight, few frames find
+                // something else for every other pixel: it does not hang together.
+                let beside = self.map.disparity.row(y - top)[x.saturating_sub(GRID / 2)];
+                let surface = beside != INVALID && now.abs_diff(beside) <= SLOPE_PX;
+                again += usize::from(surface);
                 let moved = rate.map_or(0.0, |rate| rate.row(y)[x]) * mean_time;
                 let apart = (f32::from(now) - before - moved).abs();
                 both += usize::from(apart < OFF_PX.1);

@@ -76,14 +76,15 @@ impl FigureName {
     }
 }
 
-fn failure(error: &ExperimentError) -> Failure {
+fn failure((figure, error): &(Figure, ExperimentError)) -> Failure {
+    let what = format!("{}: {error}", figure.name());
     match error {
         ExperimentError::Write { .. } | ExperimentError::Picture(_) => {
-            Failure::new(Kind::Output, error)
+            Failure::new(Kind::Output, what)
         }
-        ExperimentError::Recording(_) => Failure::new(Kind::Input, error)
+        ExperimentError::Recording(_) => Failure::new(Kind::Input, what)
             .remedy("remove the kept recording, or give another --out"),
-        _ => Failure::new(Kind::Other, error),
+        _ => Failure::new(Kind::Other, what),
     }
 }
 
@@ -101,15 +102,24 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let progress = output.progress(figures.len() as u64, "figures");
     progress.enable_steady_tick(Duration::from_millis(200));
     let mut sections: Vec<Section> = Vec::new();
+    let mut failed: Vec<(Figure, ExperimentError)> = Vec::new();
     let mut say = |what: String| progress.set_message(what);
     let asked = (args.method.map(MethodName::method), args.order.map(OrderName::shape));
     let recordings = args.out.join("recordings");
     let mut studio = Studio::new(&recordings, args.seed, asked, args.threads, &mut say);
     for figure in figures {
-        let section = figure.run(&mut studio).map_err(|e| failure(&e))?;
+        match figure.run(&mut studio) {
+            Ok(section) => sections.push(section),
+            // The other figures took minutes each: they are reported all the same.
+            Err(error) => failed.push((figure, error)),
+        }
         interrupt::check()?;
-        sections.push(section);
         progress.inc(1);
+    }
+    if sections.is_empty()
+        && let Some(first) = failed.first()
+    {
+        return Err(failure(first));
     }
     let (rendered, reused) = (studio.rendered, studio.reused);
     let seconds = begun.elapsed().as_secs_f64();
@@ -128,6 +138,9 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     );
     let json = json!({
         "made_by": made_by, "seconds": seconds, "cpu_seconds": cpu_seconds,
+        "failed": failed.iter().map(|(figure, error)| json!({
+            "figure": figure.name(), "error": error.to_string(),
+        })).collect::<Vec<_>>(),
         "figures": sections.iter().map(|s| json!({
             "figure": s.figure.name(), "title": s.title, "seconds": s.seconds,
             "cpu_seconds": s.cpu_seconds,
@@ -137,13 +150,13 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
             })).collect::<Vec<_>>(),
         })).collect::<Vec<_>>(),
     });
-    let failed = |e| output_failure(&e);
+    let unwritable = |e| output_failure(&e);
     out.file("report.html", |w| w.write_all(report::html(&sections, &made_by).as_bytes()))
-        .map_err(failed)?;
+        .map_err(unwritable)?;
     let markdown = report::markdown(&sections, &made_by);
-    out.file("report.md", |w| w.write_all(markdown.as_bytes())).map_err(failed)?;
-    out.file("report.json", |w| writeln!(w, "{json:#}")).map_err(failed)?;
-    out.commit().map_err(failed)?;
+    out.file("report.md", |w| w.write_all(markdown.as_bytes())).map_err(unwritable)?;
+    out.file("report.json", |w| writeln!(w, "{json:#}")).map_err(unwritable)?;
+    out.commit().map_err(unwritable)?;
     progress.finish_and_clear();
     let mut text = String::new();
     for section in &sections {
@@ -166,5 +179,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     }
     text += &format!("\n{made_by}\nlook at {}", args.out.join("report.html").display());
     output.result(&text, &json);
-    Ok(())
+    failed
+        .first()
+        .map_or(Ok(()), |first| Err(failure(first).remedy("the report holds the other figures")))
 }
