@@ -32,7 +32,7 @@ fn main() {
     let mut maps = DenseMaps::new(w, h);
     let mut first = DenseFit::new(level, 4, ShapeFunction::First, 1.5);
     let mut auto = DenseFit::new(level, 4, ShapeFunction::Auto, 1.5);
-    let mut settle = Settle::new(level, 4, 1.5);
+    let mut settle = Settle::new(level);
     let mut order = OrderChoice::default();
     let mut regions = Regions::default();
     let mut disparity = Image::new(w, h, f32::NAN);
@@ -70,8 +70,7 @@ fn main() {
             lap(3);
             auto.fit(s, &start, &step, &mut maps);
             lap(4);
-            settle.begin(s, &mut start);
-            settle.run(s, 0.8, &mut auto, &mut start, &mut step, &mut maps);
+            settle.run(s, (0.8, true), &step, &mut start, &mut maps);
             lap(8);
             let moved = motion.run(s, &mut auto, &start, &step, &mut maps);
             lap(7);

@@ -49,7 +49,7 @@ impl Fast {
             start: Image::new(0, 0, f32::NAN),
             step: Image::new(0, 0, 0),
             fit: DenseFit::new(level, a.subset_radius, params.shape, a.surface_px),
-            settle: Settle::new(level, a.subset_radius, a.surface_px),
+            settle: Settle::new(level),
             motion: MotionFit::new(level),
             maps: DenseMaps::new(0, 0),
             order: OrderChoice::default(),
@@ -121,10 +121,6 @@ impl Fast {
         done("search");
         begin(self.level, stack, &self.map, &mut self.start);
         self.regions.remove(&mut self.start, self.params.advanced.region_min);
-        let settles = self.params.advanced.settle_steps;
-        if settles {
-            self.settle.begin(stack, &mut self.start);
-        }
         mark_steps(
             self.level,
             &self.start,
@@ -135,9 +131,10 @@ impl Fast {
         done("steps");
         self.fit.fit(stack, &self.start, &self.step, &mut self.maps);
         done("dense");
-        if settles {
-            let Self { settle, fit, start, step, maps, .. } = self;
-            settle.run(stack, self.params.zncc_min, fit, start, step, maps);
+        if self.params.advanced.settle_steps {
+            let Self { settle, start, step, maps, .. } = self;
+            let both = self.params.shape != ShapeFunction::First;
+            settle.run(stack, (self.params.zncc_min, both), step, start, maps);
             done("settle");
         }
         if self.params.motion {

@@ -290,3 +290,33 @@ fn masked_pixels_are_invalid() {
     assert!(found.disparity_px.row(50).iter().all(|d| d.is_nan()));
     assert!(found.disparity_px.row(52)[60..150].iter().all(|d| !d.is_nan()));
 }
+
+/// Ridges 8 px long: a window of 9 x 9 pixels keeps two thirds of their height, the fine one all but a
+/// tenth; a plane beside them is measured by the usual window, with its noise.
+#[test]
+fn ridges_narrower_than_the_window_keep_their_height() {
+    let (width, height) = (260, 120);
+    let ridges = |x: f64| 0.4 * (x * std::f64::consts::TAU / 8.0).sin();
+    let shape = move |x: f64, _: f64| 12.0 + if x > 130.0 { ridges(x) } else { 0.0 };
+    let truth = Scene::new(width, height, 10, vec![Layer::everywhere(shape)]).render();
+    let mut params = Params::new(DisparityRange { min_px: -10, max_px: 40 });
+    (params.method, params.shape) = (Method::Dense, ShapeFunction::Auto);
+    let map = truth
+        .with_stack(|stack| Matcher::new(params).unwrap().match_stack(stack).unwrap().disparity_px);
+    let (mut kept, mut whole, mut squares, mut flat) = (0.0, 0.0, 0.0, 0);
+    for y in 10..height - 10 {
+        for x in 20..width - 20 {
+            let d = f64::from(map.row(y)[x]);
+            if x > 140 && !d.is_nan() {
+                let true_px = ridges(x as f64);
+                (kept, whole) = (kept + (d - 12.0) * true_px, whole + true_px * true_px);
+            } else if x < 110 {
+                (squares, flat) = (squares + (d - 12.0).powi(2), flat + 1);
+            }
+        }
+    }
+    let (amplitude, noise) = (kept / whole, (squares / f64::from(flat)).sqrt());
+    println!("{amplitude:.3} of the height kept; noise on the plane {noise:.4} px");
+    assert!((0.88..1.05).contains(&amplitude), "{amplitude}");
+    assert!(noise < 0.006, "{noise}");
+}

@@ -108,16 +108,108 @@ fn refit_both<V: Lanes>(
         // SAFETY: checked by `refit_row`.
         let (s, q) = unsafe { sums::<V, 5, 3>(window, radius, powers, PAD + at) };
         let first = first_fit(&s, &q);
-        let a = inverse_row(second_matrix(&s));
-        let slopes = a[0].mul_add(q[1][0], a[1].mul_add(q[0][1], a[5].mul(q[0][0])));
-        let curves = a[3].mul_add(q[1][1], a[4].mul(q[0][2]));
-        let second = a[2].mul_add(q[2][0], slopes.add(curves));
+        let second = second_fit(&s, &q);
         // SAFETY: as above.
         unsafe {
             store(flag, first, out[0], PAD + at);
             store(flag, second, out[1], PAD + at);
         }
     }
+}
+
+/// Radius of the window for fine shape: ridges 8 px long keep their height in it, which 9 x 9 pixels
+/// do not resolve.
+pub(crate) const FINE_RADIUS: usize = 2;
+
+/// Where the difference of the two orders bends by less and by more than this, in px, the surface is
+/// smooth, or finer than a window of the usual size. Between the two both windows are blended.
+///
+/// On a limb the difference is large as well, but changes slowly, and the usual window has half the noise.
+const FINE_PX: (f32, f32) = (0.03, 0.06);
+/// Half the base of that bend, in px: half a ridge of the length that the usual window loses.
+const BEND_REACH: usize = 4;
+/// A difference that is so many times larger counts like a bend: ridges along the row do not bend in it.
+const PER_BEND: f32 = 5.0;
+
+/// Brings the second order's disparities `second` to those of a window of [`FINE_RADIUS`] where the surface
+/// is finer than the usual window, which is told by how they differ from the `first` order's; `difference`
+/// is scratch.
+///
+/// `window` has the radius [`FINE_RADIUS`], `powers` are that radius's.
+pub(crate) fn fine_row(
+    level: Level,
+    window: &Window<'_>,
+    powers: &Powers,
+    len: usize,
+    (first, difference): (&[f32], &mut [f32]),
+    second: &mut [f32],
+) {
+    let padded = len + 2 * PAD;
+    const { assert!(FINE_RADIUS <= PAD && BEND_REACH <= PAD) };
+    assert!(len.is_multiple_of(WIDEST) && first.len() >= padded && second.len() >= padded);
+    for (to, (one, two)) in difference[..padded].iter_mut().zip(first.iter().zip(&*second)) {
+        *to = two - one;
+    }
+    for rows in [window.s, window.q, window.w] {
+        assert!(rows.len() == 2 * FINE_RADIUS + 1 && rows.iter().all(|r| r.len() >= padded));
+    }
+    dispatch!(
+        level,
+        fine_lanes(
+            window: &Window<'_> = window,
+            powers: &Powers = powers,
+            len: usize = len,
+            difference: &[f32] = &difference[..padded],
+            second: &mut [f32] = second,
+        )
+    );
+}
+
+#[inline(always)]
+fn fine_lanes<V: Lanes>(
+    window: &Window<'_>,
+    powers: &Powers,
+    len: usize,
+    difference: &[f32],
+    second: &mut [f32],
+) {
+    let zero = V::splat(0.0);
+    let low = V::splat(FINE_PX.0);
+    let per = V::splat(1.0 / (FINE_PX.1 - FINE_PX.0));
+    for at in (0..len).step_by(V::COUNT) {
+        // SAFETY: `at + COUNT <= len`, and the rows have `PAD` on either side.
+        let e = |i: usize| unsafe { V::load(difference.as_ptr().add(i)) };
+        let own = e(PAD + at);
+        let beside = e(PAD + at - BEND_REACH).add(e(PAD + at + BEND_REACH));
+        let bend = V::splat(0.5).neg_mul_add(beside, own).abs();
+        let own = own.abs().mul(V::splat(1.0 / PER_BEND));
+        // Beside a gap there is no bend.
+        let rough = V::select(own.lt(bend), bend, own);
+        if !V::any(low.lt(rough)) {
+            continue;
+        }
+        // SAFETY: checked by `fine_row`.
+        let (s, q) = unsafe { sums::<V, 5, 3>(window, FINE_RADIUS, powers, PAD + at) };
+        let fine = second_fit(&s, &q);
+        // SAFETY: as above.
+        let two = unsafe { V::load(second.as_ptr().add(PAD + at)) };
+        let part = rough.sub(low).mul(per);
+        let part = V::select(part.lt(zero), zero, part);
+        let part = V::select(part.lt(V::splat(1.0)), part, V::splat(1.0));
+        let blend = part.mul_add(fine.sub(two), two);
+        // False where the fine window is singular.
+        let known = V::splat(f32::NEG_INFINITY).lt(blend);
+        // SAFETY: as above.
+        unsafe { V::select(known, blend, two).store(second.as_mut_ptr().add(PAD + at)) };
+    }
+}
+
+#[inline(always)]
+fn second_fit<V: Lanes>(s: &[[V; 5]; 5], q: &[[V; 3]; 3]) -> V {
+    let a = inverse_row(second_matrix(s));
+    let slopes = a[0].mul_add(q[1][0], a[1].mul_add(q[0][1], a[5].mul(q[0][0])));
+    let curves = a[3].mul_add(q[1][1], a[4].mul(q[0][2]));
+    a[2].mul_add(q[2][0], slopes.add(curves))
 }
 
 #[inline(always)]

@@ -1,112 +1,110 @@
-//! Depth steps of the fast path: the pixels' own grey values decide which surface they show, and the
-//! windows that this changes are fitted once more over the judged surfaces.
+//! Depth steps of the fast path: the pixels' own grey values decide which surface they show.
+//!
+//! The dense fit is judged once. What shows another surface than its window gets that surface's
+//! disparity, continued to it; what shows none is no point. Fitting the windows around anew brought 2 to
+//! 5 % in the RMS at half of this stage's cost again, and judging the coarse map before the fit lost twice
+//! as many points as it mended: whole pixels tell surfaces apart badly on slopes.
 
 use rayon::prelude::*;
 
-use super::{DenseFit, DenseMaps, mark_steps, motion::BLOCK};
+use super::DenseMaps;
 use crate::{
     Image, Level, StereoStack,
-    step::{FRAMES_MIN, StepJudge, Verdict},
+    step::{BLOCK, FRAMES_MIN, Limits, StepJudge, for_columns},
 };
 
-/// What a verdict changes: the two fits' windows, each of the radius, read it.
-const WINDOWS: usize = 2;
+/// Coarse windows reach up to five pixels beyond a silhouette that nothing lit lies behind.
+const LIMITS: Limits =
+    Limits { passes: 6, similarity_min: 0.84, light_min: 0.0, next_light_min: 0.37 };
+
+/// Where the two orders differ by more, the second is judged: the first one's window is too coarse.
+const FINE_PX: f32 = 0.03;
 
 /// Settles depth steps; keeps its buffers between frames.
 #[derive(Debug)]
 pub struct Settle {
-    level: Level,
-    radius: usize,
-    surface_px: f32,
     judge: StepJudge,
     judged: Image<f32>,
-    verdicts: Image<Verdict>,
-    again: Image<bool>,
+    /// Blocks with steps, and these with the blocks around.
+    blocks: Image<bool>,
+    around: Image<bool>,
 }
 
 impl Settle {
-    /// For fits with windows of `radius`, whose pixels differ from the centre's by `surface_px` at most.
-    pub fn new(level: Level, radius: usize, surface_px: f32) -> Self {
+    /// With the kernels of `level`.
+    pub fn new(level: Level) -> Self {
         Self {
-            level,
-            radius,
-            surface_px,
-            judge: StepJudge::new(level),
+            judge: StepJudge::new(level).with_limits(LIMITS),
             judged: Image::new(0, 0, f32::NAN),
-            verdicts: Image::new(0, 0, Verdict::Kept),
-            again: Image::new(0, 0, false),
+            blocks: Image::new(0, 0, false),
+            around: Image::new(0, 0, false),
         }
     }
 
-    /// Judges a coarse start, so that the fit's windows hold less of other surfaces.
-    pub fn begin(&mut self, stack: &StereoStack<'_>, start: &mut Image<f32>) {
-        if stack.frames() >= FRAMES_MIN {
-            self.resize(stack);
-            self.judge.judge(stack, start, &mut self.verdicts);
-        }
-    }
-
-    /// Judges the first-order fit in `maps`, made by `fit` of `start` and `step`; points of a ZNCC below
-    /// `zncc_min` are no surface. Where pixels change surface or show none, `start` and `step` are
-    /// changed and the windows around fitted again. Does nothing with too few frames.
+    /// Judges the fit in `maps` where `step` marks windows that hold a step; points of a ZNCC below
+    /// `zncc_min` are no surface. Changes the disparities of `maps`, of both orders if `both` were
+    /// fitted, and those that the fit started from. Does nothing with too few frames.
     pub fn run(
         &mut self,
         stack: &StereoStack<'_>,
-        zncc_min: f32,
-        fit: &mut DenseFit,
+        (zncc_min, both): (f32, bool),
+        step: &Image<u8>,
         start: &mut Image<f32>,
-        step: &mut Image<u8>,
         maps: &mut DenseMaps,
     ) {
         if stack.frames() < FRAMES_MIN {
             return;
         }
-        self.resize(stack);
-        let width = stack.width();
-        let rows = self.judged.as_mut_slice().par_chunks_mut(width).enumerate();
-        rows.for_each(|(y, row)| {
-            let found = maps.first_px.row(y).iter().zip(maps.zncc.row(y));
-            for (to, (&d, &z)) in row.iter_mut().zip(found) {
-                *to = if z >= zncc_min { d } else { f32::NAN };
-            }
-        });
-        self.judge.judge(stack, &mut self.judged, &mut self.verdicts);
-        if !self.take(start) {
-            return;
-        }
-        mark_steps(self.level, start, self.radius, self.surface_px, step);
-        fit.refit(stack, start, step, None, &self.again, maps);
-    }
-
-    fn resize(&mut self, stack: &StereoStack<'_>) {
         let (width, height) = (stack.width(), stack.height());
         if (self.judged.width(), self.judged.height()) != (width, height) {
             self.judged = Image::new(width, height, f32::NAN);
-            self.verdicts = Image::new(width, height, Verdict::Kept);
-            self.again = Image::new(width.div_ceil(BLOCK), height.div_ceil(BLOCK), false);
+            self.blocks = Image::new(width.div_ceil(BLOCK), height.div_ceil(BLOCK), false);
+            self.around = self.blocks.clone();
+        }
+        self.mark_blocks(step);
+        let around = &self.around;
+        let rows = self.judged.as_mut_slice().par_chunks_mut(width).enumerate();
+        rows.for_each(|(y, row)| {
+            for_columns(Some(around), y, width, |from, to| {
+                let found = maps.first_px.row(y)[from..to].iter().zip(&maps.zncc.row(y)[from..to]);
+                for (to, (&d, &z)) in row[from..to].iter_mut().zip(found) {
+                    *to = if z >= zncc_min { d } else { f32::NAN };
+                }
+                if both {
+                    let second = &maps.second_px.row(y)[from..to];
+                    for (to, &d) in row[from..to].iter_mut().zip(second) {
+                        *to = if (d - *to).abs() > FINE_PX { d } else { *to };
+                    }
+                }
+            });
+        });
+        for &i in self.judge.change(stack, &mut self.judged, Some(&self.blocks)) {
+            let i = i as usize;
+            let to = self.judged.as_slice()[i];
+            start.as_mut_slice()[i] = to;
+            maps.first_px.as_mut_slice()[i] = to;
+            maps.second_px.as_mut_slice()[i] = to;
         }
     }
 
-    /// Takes over what was judged, and marks the blocks that must be fitted again; whether there are
-    /// any.
-    fn take(&mut self, start: &mut Image<f32>) -> bool {
-        let (width, height) = (start.width(), start.height());
-        self.again.as_mut_slice().fill(false);
-        let reach = WINDOWS * self.radius;
-        let mut any = false;
-        for y in 0..height {
-            for (x, verdict) in self.verdicts.row(y).iter().enumerate() {
-                if *verdict == Verdict::Kept {
-                    continue;
+    /// Marks the blocks that hold a step, and the blocks around.
+    fn mark_blocks(&mut self, step: &Image<u8>) {
+        let (columns, rows) = (self.blocks.width(), self.blocks.height());
+        self.around.as_mut_slice().fill(false);
+        for row in 0..rows {
+            let set = self.blocks.row_mut(row);
+            set.fill(false);
+            for y in row * BLOCK..((row + 1) * BLOCK).min(step.height()) {
+                for (set, marks) in set.iter_mut().zip(step.row(y).chunks(BLOCK)) {
+                    *set |= marks.iter().fold(0, |any, mark| any | mark) != 0;
                 }
-                any = true;
-                start.row_mut(y)[x] = self.judged.row(y)[x];
-                let columns = x.saturating_sub(reach) / BLOCK..=(x + reach).min(width - 1) / BLOCK;
-                for row in y.saturating_sub(reach) / BLOCK..=(y + reach).min(height - 1) / BLOCK {
-                    self.again.row_mut(row)[columns.clone()].fill(true);
+            }
+            for column in (0..columns).filter(|&column| self.blocks.row(row)[column]) {
+                for y in row.saturating_sub(1)..(row + 2).min(rows) {
+                    let across = column.saturating_sub(1)..(column + 2).min(columns);
+                    self.around.row_mut(y)[across].fill(true);
                 }
             }
         }
-        any
     }
 }

@@ -14,7 +14,7 @@ use super::{
     moments::{PAD, Powers, powers, slide_sum},
     motion::Motion,
     normalise::{Terms, Windowed, gain_row, product_row, residual_row, restart_row, zncc_row},
-    refit::{Window, refit_row},
+    refit::{FINE_RADIUS, Window, fine_row, refit_row},
     solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
     warp::{Source, Warped, moving, warp_row},
 };
@@ -115,6 +115,7 @@ pub(crate) struct Tile {
     threes: Aligned<f32>,
     flagged: Aligned<f32>,
     powers: Powers,
+    fine_powers: Powers,
     w0: Ring,
     /// Static sums.
     s: Ring,
@@ -201,7 +202,7 @@ impl Tile {
         }
         self.threes.resize(stride, 0.0);
         self.flagged.resize(len, 0.0);
-        self.powers = powers(radius);
+        (self.powers, self.fine_powers) = (powers(radius), powers(FINE_RADIUS));
         for ring in [&mut self.w0, &mut self.il, &mut self.i, &mut self.w1] {
             ring.resize(stride, 3 * radius + 1);
         }
@@ -466,9 +467,9 @@ impl Tile {
     fn fits(&mut self, job: &Job<'_>, y: isize, x0: usize, inside: bool, again: bool) {
         let (level, r, len) = (job.level, job.radius, self.len);
         // The start of the second pass needs no more than the first order.
-        let (pass, w, fits) = match again {
-            false => (&self.first, &self.w0, Fits::First),
-            true => (&self.second, &self.w1, job.fits),
+        let (pass, fits) = match again {
+            false => (&self.first, Fits::First),
+            true => (&self.second, job.fits),
         };
         let count = if fits == Fits::First { 1 } else { 2 };
         let inverse = self.inverse.each_ref().map(|h| h.row(y));
@@ -479,11 +480,35 @@ impl Tile {
         if !inside {
             return;
         }
+        self.fits_at_steps(job, y, x0, (again, fits));
+        if again && fits == Fits::Both && r > FINE_RADIUS {
+            let [first, second] = &mut self.fit;
+            let (first, second) = (first.row(y), second.row_mut(y));
+            around(&self.s_used, y, FINE_RADIUS, |s| {
+                around(&self.second.q, y, FINE_RADIUS, |q| {
+                    around(&self.w1, y, FINE_RADIUS, |w| {
+                        let window = Window { s, q, w, limit: job.surface_px };
+                        let rows = (first, &mut self.threes[..]);
+                        fine_row(level, &window, &self.fine_powers, len, rows, second);
+                    });
+                });
+            });
+        }
+    }
+
+    /// The fits of row `y` whose windows hold a depth step, by the pixels on the centre's side of it.
+    fn fits_at_steps(&mut self, job: &Job<'_>, y: isize, x0: usize, (again, fits): (bool, Fits)) {
+        let (level, r, len) = (job.level, job.radius, self.len);
+        let (pass, w) = match again {
+            false => (&self.first, &self.w0),
+            true => (&self.second, &self.w1),
+        };
         let step = &job.step.row(y as usize)[x0..];
         let step = &step[..step.len().min(len)];
         if step.iter().fold(0, |any, s| any | s) == 0 {
             return;
         }
+        let mut out = self.fit.each_mut().map(|h| h.row_mut(y));
         for (flag, &step) in self.flagged.iter_mut().zip(step) {
             *flag = f32::from(step);
         }

@@ -39,6 +39,7 @@ pub(crate) struct Candidates {
 impl Candidates {
     /// Looks along the four axes from (x, y), whose own surface is `own`, for the first pixel of
     /// another surface.
+    #[inline(always)]
     pub fn around(map: &Image<f32>, x: usize, y: usize, own: &Candidate) -> Self {
         let mut candidates = Self::default();
         for (k, (sx, sy)) in [(-1, 0), (1, 0), (0, -1), (0, 1)].into_iter().enumerate() {
@@ -76,6 +77,7 @@ impl Candidates {
 
 /// The plane through (x, y) with the slopes to its neighbours two pixels away that are on the same
 /// surface; level where there are none.
+#[inline(always)]
 pub(crate) fn plane(map: &Image<f32>, x: usize, y: usize, value: f32) -> Candidate {
     let slope = |sx: isize, sy: isize| {
         let side = |sign: isize| {
@@ -101,6 +103,7 @@ pub(crate) fn plane(map: &Image<f32>, x: usize, y: usize, value: f32) -> Candida
 
 /// The surface that the map gives pixel (x, y), which is a number there. Inwards is where most of the
 /// pixels around on the same surface are, in one of eight directions; nowhere when they are all around.
+#[inline(always)]
 pub(crate) fn own(map: &Image<f32>, x: usize, y: usize) -> Candidate {
     let plane = plane(map, x, y, map.row(y)[x]);
     let (mut sx, mut sy) = (0i32, 0i32);

@@ -1,9 +1,9 @@
 //! The verdict on one pixel.
 
 use super::{
-    ALONG_PX, STEEP,
+    ALONG_PX, Limits, STEEP,
     candidates::{Candidate, Candidates, own},
-    signature::{Signature, signature},
+    signature::{Samples, Signature},
 };
 use crate::{Image, StereoStack};
 
@@ -32,9 +32,10 @@ const INSIDE_STEPS: i32 = 3;
 
 /// What verdicts are made from.
 pub(super) struct Judge<'a> {
-    pub stack: &'a StereoStack<'a>,
-    pub disparity_px: &'a Image<f32>,
-    pub beside: &'a Image<u8>,
+    samples: Samples<'a>,
+    disparity_px: &'a Image<f32>,
+    beside: &'a Image<u8>,
+    limits: &'a Limits,
 }
 
 /// How well a surface explains a pixel.
@@ -48,36 +49,53 @@ struct Evidence {
 }
 
 impl Evidence {
-    fn suffices(&self) -> bool {
-        self.light >= LIGHT_MIN
-            && self.next_light >= NEXT_LIGHT_MIN
-            && self.similarity >= SIMILARITY_MIN
+    fn suffices(&self, limits: &Limits) -> bool {
+        self.light >= limits.light_min
+            && self.next_light >= limits.next_light_min
+            && self.similarity >= limits.similarity_min
     }
 
     /// Enough for a surface that the map did not have at the pixel.
-    fn convinces(&self) -> bool {
-        self.suffices() && self.similarity >= MOVED_SIMILARITY_MIN
+    fn convinces(&self, limits: &Limits) -> bool {
+        self.suffices(limits) && self.similarity >= MOVED_SIMILARITY_MIN
     }
 }
 
-impl Judge<'_> {
+impl<'a> Judge<'a> {
+    pub fn new(
+        stack: &'a StereoStack<'a>,
+        disparity_px: &'a Image<f32>,
+        beside: &'a Image<u8>,
+        limits: &'a Limits,
+    ) -> Self {
+        Self { samples: Samples::new(stack), disparity_px, beside, limits }
+    }
+
+    /// As [`Self::pixel`], of a place in the map.
+    #[inline(always)]
+    pub fn place(&self, i: usize) -> Option<Option<f32>> {
+        let width = self.disparity_px.width();
+        self.pixel(i % width, i / width)
+    }
+
     /// `None` when the pixel's disparity stands, else what takes its place (`Some(None)`: nothing).
+    #[inline(always)]
     pub fn pixel(&self, x: usize, y: usize) -> Option<Option<f32>> {
         let own_px = self.disparity_px.row(y)[x];
         let own = own(self.disparity_px, x, y);
         // Where the right camera's view ends, nothing can be said.
-        let own_evidence = self.evidence(x, y, &own, SIMILARITY_MIN)?;
+        let own_evidence = self.evidence(x, y, &own, self.limits.similarity_min)?;
         let mut best: Option<(Evidence, f32)> = None;
         for other in Candidates::around(self.disparity_px, x, y, &own).iter() {
             let evidence = self.evidence(x, y, other, MOVED_SIMILARITY_MIN);
-            let Some(evidence) = evidence.filter(Evidence::convinces) else {
+            let Some(evidence) = evidence.filter(|e| e.convinces(self.limits)) else {
                 continue;
             };
             if best.is_none_or(|(b, _)| evidence.similarity > b.similarity) {
                 best = Some((evidence, other.disparity_px));
             }
         }
-        match (Some(own_evidence).filter(Evidence::suffices), best) {
+        match (Some(own_evidence).filter(|e| e.suffices(self.limits)), best) {
             (None, None) => Some(None),
             (None, Some((_, to))) => Some(Some(to)),
             (Some(_), None) => None,
@@ -97,6 +115,7 @@ impl Judge<'_> {
 
     /// Pools the pixel and its two neighbours along the step; `None` where the right camera
     /// does not see the candidate. Below a similarity of `least` nothing else is looked at.
+    #[inline(always)]
     fn evidence(&self, x: usize, y: usize, candidate: &Candidate, least: f32) -> Option<Evidence> {
         let own_px = self.disparity_px.row(y)[x];
         // The row along the step: across the direction inwards.
@@ -115,7 +134,7 @@ impl Judge<'_> {
                 continue;
             }
             let at_px = candidate.at(dx, dy);
-            if let Some(one) = signature(self.stack, px, py, at_px) {
+            if let Some(one) = self.samples.signature(px, py, at_px) {
                 pooled.add(&one);
                 *found = (px, py, at_px, one.cov);
             }
@@ -128,22 +147,28 @@ impl Judge<'_> {
             return Some(none);
         }
         let (mut next, mut inside, mut inside_own) = (0.0, 0.0, 0.0);
-        for &(px, py, at_px, cov) in found() {
+        for &(px, py, at_px, _) in found() {
             next += self.inwards(px, py, at_px, candidate, 0);
+        }
+        // NaN where a pixel has no next one: no comparison holds then.
+        let known = next > 0.0 && candidate.inwards != (0, 0);
+        if known && self.limits.light_min <= 0.0 {
+            return Some(Evidence { light: 1.0, next_light: pooled.cov / next, similarity });
+        }
+        for &(px, py, at_px, cov) in found() {
             let deep = self.inwards(px, py, at_px, candidate, INSIDE_STEPS);
             if !deep.is_nan() {
                 (inside, inside_own) = (inside + deep, inside_own + cov);
             }
         }
         let light = if inside > 0.0 { inside_own / inside } else { 1.0 };
-        // NaN where a pixel has no next one: no comparison holds then.
-        let known = next > 0.0 && candidate.inwards != (0, 0);
         let next_light = if known { pooled.cov / next } else { 1.0 };
         Some(Evidence { light, next_light, similarity })
     }
 
     /// Light of the pixel inwards of (x, y) on the candidate's surface, whose disparity at (x, y) is
     /// `at_px`, or of the one that is `beyond` pixels farther; NaN where there is none.
+    #[inline(always)]
     fn inwards(&self, x: usize, y: usize, at_px: f32, candidate: &Candidate, beyond: i32) -> f32 {
         let (ix, iy) = candidate.inwards;
         let (dx, dy) = (ix + beyond * ix.signum(), iy + beyond * iy.signum());
@@ -157,6 +182,6 @@ impl Judge<'_> {
         }
         // Where the map has another surface next to the pixel, this one is continued.
         let disparity_px = if on { known } else { at_px };
-        signature(self.stack, px, py, disparity_px).map_or(f32::NAN, |s| s.cov)
+        self.samples.signature(px, py, disparity_px).map_or(f32::NAN, |s| s.cov)
     }
 }

@@ -58,15 +58,53 @@ pub enum Verdict {
     Removed,
 }
 
+/// How strictly pixels are judged.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// How many pixels deep a surface is peeled.
+    pub passes: usize,
+    /// Least similarity of the grey values over time.
+    pub similarity_min: f32,
+    /// Least light, as a part of that inside the surface. Not looked at when 0 and the next pixel's light
+    /// is known, which saves a third of the work.
+    pub light_min: f32,
+    /// Least light, as a part of the next pixel's inside the surface.
+    pub next_light_min: f32,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            passes: PASSES,
+            similarity_min: SIMILARITY_MIN,
+            light_min: LIGHT_MIN,
+            next_light_min: NEXT_LIGHT_MIN,
+        }
+    }
+}
+
+/// Side of the blocks that [`StepJudge::change`] can be kept to.
+pub(crate) const BLOCK: usize = 16;
+
+/// Pixels that a task judges.
+const TASK: usize = 64;
+
+/// A mark of a pixel beside a step...
+const BESIDE: u8 = 1;
+/// ...whose disparity was changed.
+const CHANGED: u8 = 2;
+
 /// Judges pixels at depth steps; keeps its buffers between frames.
 #[derive(Debug)]
 pub struct StepJudge {
     level: Level,
+    limits: Limits,
     near: Image<u8>,
     beside: Image<u8>,
     /// Pixels to judge in a pass, and what takes their disparity's place.
     open: Vec<u32>,
     proposals: Vec<Option<Option<f32>>>,
+    changed: Vec<u32>,
     columns: PerThread<Vec<u8>>,
 }
 
@@ -76,12 +114,20 @@ impl StepJudge {
         let none = || Image::new(0, 0, 0);
         Self {
             level: level.usable(),
+            limits: Limits::default(),
             near: none(),
             beside: none(),
             open: Vec::new(),
             proposals: Vec::new(),
+            changed: Vec::new(),
             columns: PerThread::default(),
         }
+    }
+
+    /// The same judge with other limits.
+    pub fn with_limits(mut self, limits: Limits) -> Self {
+        self.limits = limits;
+        self
     }
 
     /// Judges the pixels of `disparity_px` (NaN is invalid) beside steps and gaps, changes it where
@@ -98,57 +144,86 @@ impl StepJudge {
         verdicts: &mut Image<Verdict>,
     ) {
         let (width, height) = (stack.width(), stack.height());
-        assert_eq!((disparity_px.width(), disparity_px.height()), (width, height));
         assert_eq!((verdicts.width(), verdicts.height()), (width, height));
         verdicts.as_mut_slice().fill(Verdict::Kept);
-        if (self.near.width(), self.near.height()) != (width, height) {
-            self.beside = Image::new(width, height, 0);
-            self.near = Image::new(width, height, 0);
+        for &i in self.change(stack, disparity_px, None) {
+            let gone = disparity_px.as_slice()[i as usize].is_nan();
+            verdicts.as_mut_slice()[i as usize] =
+                if gone { Verdict::Removed } else { Verdict::Moved };
         }
+    }
+
+    /// As [`Self::judge`]; gives the places in `disparity_px` that it changed, in order. With `blocks`
+    /// of [`BLOCK`] pixels a side, only those set begin to be looked at: what is peeled may reach beyond,
+    /// and the map must be whole in the blocks around.
+    pub(crate) fn change(
+        &mut self,
+        stack: &StereoStack<'_>,
+        disparity_px: &mut Image<f32>,
+        blocks: Option<&Image<bool>>,
+    ) -> &[u32] {
+        let (width, height) = (stack.width(), stack.height());
+        assert_eq!((disparity_px.width(), disparity_px.height()), (width, height));
+        if (self.beside.width(), self.beside.height()) != (width, height) {
+            self.beside = Image::new(width, height, 0);
+        }
+        self.changed.clear();
         if stack.frames() < FRAMES_MIN {
             self.beside.as_mut_slice().fill(0);
-            return;
+            return &self.changed;
         }
-        self.mark_beside(stack, disparity_px);
+        self.mark_beside(stack, disparity_px, blocks);
         self.open.clear();
-        let marks = self.beside.as_slice().iter().enumerate();
-        self.open.extend(marks.filter(|(_, b)| **b != 0).map(|(i, _)| i as u32));
-        for _ in 0..PASSES {
-            let judge = Judge { stack, disparity_px, beside: &self.beside };
-            self.proposals.resize(self.open.len(), None);
-            self.open.par_iter().zip(&mut self.proposals).with_min_len(64).for_each(|(&i, to)| {
-                *to = judge.pixel(i as usize % width, i as usize / width);
+        for y in 0..height {
+            for_columns(blocks, y, width, |from, to| {
+                let marks = self.beside.row(y)[from..to].iter().zip(y * width + from..);
+                self.open.extend(marks.filter(|(b, _)| **b != 0).map(|(_, i)| i as u32));
             });
-            let mut changed = 0;
-            for k in 0..self.open.len() {
-                let Some(to) = self.proposals[k] else { continue };
-                let i = self.open[k] as usize;
-                disparity_px.as_mut_slice()[i] = to.unwrap_or(f32::NAN);
-                verdicts.as_mut_slice()[i] = to.map_or(Verdict::Removed, |_| Verdict::Moved);
-                self.open[changed] = i as u32;
-                changed += 1;
+        }
+        for _ in 0..self.limits.passes {
+            let judge = Judge::new(stack, disparity_px, &self.beside, &self.limits);
+            self.proposals.resize(self.open.len(), None);
+            let level = self.level;
+            let parts = self.open.par_chunks(TASK).zip(self.proposals.par_chunks_mut(TASK));
+            parts.for_each(|(open, to)| {
+                vectorised!(
+                    level,
+                    judge_loop(
+                        judge: &Judge<'_> = &judge,
+                        open: &[u32] = open,
+                        to: &mut [Option<Option<f32>>] = to,
+                    )
+                );
+            });
+            let first = self.changed.len();
+            for (&i, to) in self.open.iter().zip(&self.proposals) {
+                let Some(to) = *to else { continue };
+                disparity_px.as_mut_slice()[i as usize] = to.unwrap_or(f32::NAN);
+                self.beside.as_mut_slice()[i as usize] = CHANGED;
+                self.changed.push(i);
             }
-            if changed == 0 {
-                break;
-            }
-            self.open.truncate(changed);
+            self.open.clear();
             // What the changed pixels hid is beside a step or a gap now.
-            for k in 0..changed {
-                let (x, y) = (self.open[k] as usize % width, self.open[k] as usize / width);
+            for &i in &self.changed[first..] {
+                let (x, y) = (i as usize % width, i as usize / width);
                 for (nx, ny) in around(x, y, width, height) {
                     let n = ny * width + nx;
-                    if verdicts.as_slice()[n] == Verdict::Kept
+                    if self.beside.as_slice()[n] != CHANGED
                         && is_beside(stack, disparity_px, nx, ny)
                     {
-                        self.beside.as_mut_slice()[n] = 1;
+                        self.beside.as_mut_slice()[n] = BESIDE;
                         self.open.push(n as u32);
                     }
                 }
             }
-            self.open.drain(..changed);
+            if self.open.is_empty() {
+                break;
+            }
             self.open.sort_unstable();
             self.open.dedup();
         }
+        self.changed.sort_unstable();
+        &self.changed
     }
 
     /// The pixels (non-zero) near the steps of the last map judged: subsets there may hold another
@@ -159,27 +234,41 @@ impl StepJudge {
     }
 
     /// Marks valid pixels with a step or a gap to one of their four neighbours.
-    fn mark_beside(&mut self, stack: &StereoStack<'_>, disparity_px: &Image<f32>) {
+    fn mark_beside(
+        &mut self,
+        stack: &StereoStack<'_>,
+        disparity_px: &Image<f32>,
+        blocks: Option<&Image<bool>>,
+    ) {
         let (width, height) = (disparity_px.width(), disparity_px.height());
         let level = self.level;
         self.beside.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, out)| {
             let (above, below) = (y.saturating_sub(1), (y + 1).min(height - 1));
-            vectorised!(
-                level,
-                mark_row(
-                    rows: [&[f32]; 3] = [above, y, below].map(|y| disparity_px.row(y)),
-                    out: &mut [u8] = out,
-                )
-            );
-            for (x, out) in out.iter_mut().enumerate().filter(|(_, out)| **out != 0) {
-                *out = u8::from(is_beside(stack, disparity_px, x, y));
-            }
+            let rows = [above, y, below].map(|y| disparity_px.row(y));
+            out.fill(0);
+            for_columns(blocks, y, width, |from, to| {
+                vectorised!(
+                    level,
+                    mark_row(
+                        rows: [&[f32]; 3] = rows,
+                        from: usize = from,
+                        out: &mut [u8] = &mut out[from..to],
+                    )
+                );
+                let marks = out[from..to].iter_mut().zip(from..);
+                for (out, x) in marks.filter(|(out, _)| **out != 0) {
+                    *out = u8::from(is_beside(stack, disparity_px, x, y));
+                }
+            });
         });
     }
 
     /// Marks all pixels within [`NEAR_RADIUS`] of those beside steps.
     fn mark_near(&mut self) {
         let (width, height) = (self.beside.width(), self.beside.height());
+        if (self.near.width(), self.near.height()) != (width, height) {
+            self.near = Image::new(width, height, 0);
+        }
         let (level, beside, columns) = (self.level, &self.beside, self.columns.ready());
         self.near.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, out)| {
             columns.with(|column| {
@@ -195,8 +284,16 @@ impl StepJudge {
     }
 }
 
+#[inline(always)]
+fn judge_loop(judge: &Judge<'_>, open: &[u32], to: &mut [Option<Option<f32>>]) {
+    for (&i, to) in open.iter().zip(to) {
+        *to = judge.place(i as usize);
+    }
+}
+
 /// Whether left pixel (x, y), continued from a neighbour of disparity `own_px`, is outside a camera's
 /// view.
+#[inline(always)]
 fn is_hidden(stack: &StereoStack<'_>, x: usize, y: usize, own_px: f32) -> bool {
     let at = (x as f32 - own_px + 0.5).floor();
     let seen = |mask: Option<&Image<u8>>, x: usize| mask.is_none_or(|m| m.row(y)[x] != 0);
@@ -258,19 +355,43 @@ fn is_steep(map: &Image<f32>, (x, y): (usize, usize), (nx, ny): (usize, usize)) 
     joined(before, map.row(y)[x], map.row(ny)[nx], after)
 }
 
-/// Marks the middle row's valid pixels with a step or a gap to one of their four neighbours.
+/// Calls `work` with the ranges of columns of row `y` in blocks that are set; with the whole row without
+/// blocks.
+pub(crate) fn for_columns(
+    blocks: Option<&Image<bool>>,
+    y: usize,
+    width: usize,
+    mut work: impl FnMut(usize, usize),
+) {
+    let Some(blocks) = blocks else { return work(0, width) };
+    let mut from = 0;
+    for run in blocks.row(y / BLOCK).chunk_by(|a, b| a == b) {
+        if run[0] {
+            work(from * BLOCK, ((from + run.len()) * BLOCK).min(width));
+        }
+        from += run.len();
+    }
+}
+
+/// Marks, in `out`, the middle row's valid pixels from column `from` on that have a step or a gap to one
+/// of their four neighbours.
 #[inline(always)]
-fn mark_row(rows: [&[f32]; 3], out: &mut [u8]) {
-    let width = out.len();
-    let [above, row, below] = rows.map(|r| &r[..width]);
-    for x in 0..width {
+fn mark_row(rows: [&[f32]; 3], from: usize, out: &mut [u8]) {
+    let width = rows[1].len();
+    let to = from + out.len();
+    let [above, row, below] = rows.map(|r| &r[from..to]);
+    for x in 0..out.len() {
         let own = row[x];
         out[x] = u8::from(!own.is_nan() & (is_far(above[x], own) | is_far(below[x], own)));
     }
-    for x in 1..width {
-        let step = is_far(row[x - 1], row[x]);
-        out[x] |= u8::from(step & !row[x].is_nan());
-        out[x - 1] |= u8::from(step & !row[x - 1].is_nan());
+    let left = from.max(1);
+    let pairs = rows[1][left - 1..].iter().zip(&rows[1][left..to]);
+    for (out, (left, own)) in out[left - from..].iter_mut().zip(pairs) {
+        *out |= u8::from(is_far(*left, *own) & !own.is_nan());
+    }
+    let pairs = rows[1][(from + 1).min(width)..].iter().zip(row);
+    for (out, (right, own)) in out.iter_mut().zip(pairs) {
+        *out |= u8::from(is_far(*right, *own) & !own.is_nan());
     }
 }
 
