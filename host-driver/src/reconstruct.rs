@@ -33,8 +33,9 @@ pub struct Options {
     pub first: usize,
     /// Threads of the matcher; all cores when `None`.
     pub threads: Option<usize>,
-    /// Whether the dense method lets the pixels' own grey values decide at depth steps.
-    pub settle_steps: bool,
+    /// Whether the dense method takes depth steps as the coarse search places them, instead of letting
+    /// the pixels' own grey values decide.
+    pub keep_steps: bool,
 }
 
 /// Why a recording has no depth.
@@ -214,7 +215,7 @@ pub fn reconstruct(
     params.method = options.method;
     params.shape = options.shape;
     params.advanced.threads = options.threads;
-    params.advanced.settle_steps = options.settle_steps;
+    params.advanced.settle_steps = !options.keep_steps;
     let mut matcher = Matcher::new(params)?;
     let matched = stack.matched(&mut matcher, 0..stack.len())?;
     watch.step("match");

@@ -1,7 +1,10 @@
 //! Accuracy on the simulated sensor: recordings of known scenes, reconstructed and compared with the
 //! truth behind every pixel.
 
+pub mod budget;
 pub mod capture;
+pub mod circles;
+pub mod compare;
 pub mod maps;
 pub mod resampling;
 pub mod score;

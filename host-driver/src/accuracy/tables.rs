@@ -4,6 +4,7 @@ use serde::Serialize;
 use stspp_hil_sim::world::{SceneSpec, SensorModel, WorldError};
 use stspp_matcher::{Error as MatchError, Matcher, Method, Params, ShapeFunction};
 
+use super::circles::{self, FoundCircle};
 use super::score::{central_plane_mm, score, sphere_rms_mm};
 use super::{CanvasTruth, Capture, Score};
 use crate::DepthFrame;
@@ -43,14 +44,14 @@ pub struct Setting {
     pub shape: ShapeFunction,
     /// Threads of the matcher; all cores when `None`.
     pub threads: Option<usize>,
-    /// Whether the dense method settles depth steps by the pixels' own grey values.
-    pub settle_steps: bool,
+    /// Whether the dense method takes depth steps as the coarse search places them.
+    pub keep_steps: bool,
 }
 
 impl From<&Options> for Setting {
     fn from(options: &Options) -> Self {
-        let Options { method, shape, threads, settle_steps, .. } = *options;
-        Self { method, shape, threads, settle_steps }
+        let Options { method, shape, threads, keep_steps, .. } = *options;
+        Self { method, shape, threads, keep_steps }
     }
 }
 
@@ -132,9 +133,21 @@ impl Case {
         &self.stack
     }
 
-    /// The truth of its canvas.
+    /// The truth of its canvas, of a moving scene that at the middle of the recording.
     pub fn truth(&self) -> &CanvasTruth {
         &self.truth
+    }
+
+    /// The truth of its canvas that a match of `frames` pairs is compared with: a matcher that estimates
+    /// motion gives the newest frame's depth, others that of the window's middle.
+    pub fn truth_for(&self, setting: Setting, frames: usize) -> &CanvasTruth {
+        let with_motion = setting.method == Method::Dense && frames == self.stack.len();
+        self.newest.as_ref().filter(|_| with_motion).unwrap_or(&self.truth)
+    }
+
+    /// The scene's circles in a frame of the first `frames` pairs.
+    pub fn circles(&self, frame: &DepthFrame, frames: usize) -> Vec<FoundCircle> {
+        circles::find(frame, &self.capture.world, self.capture.centre_ns(0..frames))
     }
 
     /// Matches the first `frames` pairs and compares with the truth. Also gives the depth frame.
@@ -151,15 +164,13 @@ impl Case {
         params.method = setting.method;
         params.shape = setting.shape;
         params.advanced.threads = setting.threads;
-        params.advanced.settle_steps = setting.settle_steps;
+        params.advanced.settle_steps = !setting.keep_steps;
         let mut matcher = Matcher::new(params)?;
         let start = std::time::Instant::now();
         let frame = self.stack.depth_frame(&mut matcher, 0..frames)?;
         let match_wall_ms = start.elapsed().as_secs_f64() * 1e3;
         let world = &self.capture.world;
-        // A matcher that estimates motion gives the newest frame's depth.
-        let with_motion = setting.method == Method::Dense && frames == self.stack.len();
-        let truth = self.newest.as_ref().filter(|_| with_motion).unwrap_or(&self.truth);
+        let truth = self.truth_for(setting, frames);
         let sphere = |incidence_max_deg| {
             let fit =
                 sphere_rms_mm(&frame, truth, world, SPHERE_RADIUS_M, MARGIN_PX, incidence_max_deg);

@@ -1,11 +1,8 @@
 //! Figure 7: an industrial part, its surfaces and its circles.
 
-use nalgebra::Point3;
-use stspp_hil_sim::world::{Camera, PrimitiveShape};
-
 use super::{ExperimentError, Figure, Good, Row, Section, Studio, pictures};
+use crate::accuracy::circles;
 use crate::accuracy::score::score;
-use crate::measure::circle::{self, RimSearch};
 
 /// Radius up to which circles are too small for the camera, metres (paper: 3 mm).
 const SMALL_M: f64 = 0.004;
@@ -35,40 +32,17 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
             scored.surface_median_mm
         )),
     );
-    let cloud: Vec<Point3<f64>> =
-        frame.point_cloud().points_left_m.iter().map(|p| p.cast()).collect();
-    let of_world = take.world.truth();
     let (mut centres, mut radii) = (Vec::new(), Vec::new());
     let mut lost = Vec::new();
-    for primitive in of_world.primitives(take.centre_ns) {
-        let PrimitiveShape::Circle { centre_left_m, normal_left, radius_m } = primitive.shape
-        else {
-            continue;
-        };
-        // The whole rim must be in the picture of both cameras.
-        let rim_is_seen = (0..16).all(|k| {
-            let (u, v) = across(&normal_left);
-            let (s, c) = (f64::from(k) * std::f64::consts::TAU / 16.0).sin_cos();
-            let p = centre_left_m + (u * c + v * s) * radius_m + normal_left * 1e-4;
-            [Camera::Left, Camera::Right]
-                .into_iter()
-                .all(|camera| of_world.visible_from(camera, &p, take.centre_ns))
-        });
-        if !rim_is_seen {
-            continue;
-        }
-        let centre = Point3::from(centre_left_m);
-        let search = RimSearch::around(centre, radius_m);
-        let reach_m = search.reach_m + 0.5 * radius_m + 4e-3;
-        let around: Vec<_> =
-            cloud.iter().copied().filter(|p| (p - centre).norm() < reach_m).collect();
+    for circle in circles::find(&frame, &take.world, take.centre_ns) {
+        let (centre, radius_m) = (circle.centre_m, circle.radius_m);
         let name = format!(
             "{:.0} mm at ({:.0}, {:.0}) mm",
             radius_m * 1e3,
             centre.x * 1e3,
             centre.y * 1e3
         );
-        match circle::rim(&around, &search) {
+        match circle.rim {
             Ok(rim) => {
                 let off_mm = (rim.circle.centre_m - centre).norm() * 1e3;
                 let radius_mm = (rim.circle.radius_m - radius_m) * 1e3;
@@ -132,10 +106,4 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
     section.pictures.push(pictures::depth(&frame, "Depth")?);
     section.pictures.push(pictures::error(&frame, &truth, 0.2, "Depth error")?);
     Ok(section)
-}
-
-fn across(axis: &nalgebra::Vector3<f64>) -> (nalgebra::Vector3<f64>, nalgebra::Vector3<f64>) {
-    let helper = if axis.x.abs() < 0.7 { nalgebra::Vector3::x() } else { nalgebra::Vector3::y() };
-    let u = axis.cross(&helper).normalize();
-    (u, axis.cross(&u))
 }

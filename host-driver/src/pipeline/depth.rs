@@ -87,7 +87,7 @@ impl DepthEngine {
         params.method = options.method;
         params.shape = options.shape;
         params.advanced.threads = options.threads;
-        params.advanced.settle_steps = options.settle_steps;
+        params.advanced.settle_steps = !options.keep_steps;
         if let Some(frames) = options.frames.filter(|frames| !(1..=FRAMES_MAX).contains(frames)) {
             return Err(stspp_matcher::Error::FrameCount { frames }.into());
         }

@@ -6,6 +6,8 @@ mod accuracy;
 mod calibration;
 #[cfg(feature = "sim")]
 mod check;
+#[cfg(feature = "sim")]
+mod compare;
 mod icp;
 #[cfg(feature = "sim")]
 mod resampling;
@@ -36,6 +38,8 @@ enum What {
     #[cfg(feature = "sim")]
     Check(check::Args),
     #[cfg(feature = "sim")]
+    Compare(compare::Args),
+    #[cfg(feature = "sim")]
     Resampling(resampling::Args),
 }
 
@@ -49,6 +53,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         Some(What::Calibration(args)) => calibration::run(args, output),
         #[cfg(feature = "sim")]
         Some(What::Check(args)) => check::run(args, output),
+        #[cfg(feature = "sim")]
+        Some(What::Compare(args)) => compare::run(args, output),
         #[cfg(feature = "sim")]
         Some(What::Resampling(args)) => resampling::run(args, output),
         None => timing::run(&args.timing, output),

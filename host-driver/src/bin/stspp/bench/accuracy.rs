@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use serde_json::json;
+use stspp::accuracy::budget::{self, Class};
 use stspp::accuracy::maps;
 use stspp::accuracy::tables::{self, AccuracyError, Case, Line, Setting};
 use stspp::export::folder::OutputFolder;
@@ -27,6 +28,10 @@ pub struct Args {
     /// Seed of the simulated sensor: other dots, tolerances and noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Also print what each line's error is made of: its pixels by distance from true steps, slope,
+    /// curvature and incidence.
+    #[arg(long)]
+    budget: bool,
     #[command(flatten)]
     matching: Matching,
 }
@@ -54,6 +59,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let frames = args.matching.frames.unwrap_or(10);
     let spinner = output.spinner();
     let mut lines: Vec<Line> = Vec::new();
+    let mut budgets: Vec<(String, Vec<Class>)> = Vec::new();
     let mut folder = match &args.maps {
         Some(path) => Some(OutputFolder::create(path, true).map_err(|e| output_failure(&e))?),
         None => None,
@@ -61,12 +67,17 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let mut measure = |case: &Case, name: &str, frames: usize, setting: Setting| {
         spinner.set_message(format!("{name}: matching {frames} frames"));
         let (line, frame) = case.line(name, frames, setting).map_err(|e| failure(&e))?;
+        let truth = case.truth_for(setting, frames);
         if let Some(folder) = &mut folder {
             let method = format!("{:?}-{:?}", setting.method, setting.shape).to_lowercase();
             let file = format!("{}-{frames}-{method}.png", name.replace(' ', "-"));
             folder
-                .file(&file, |out| maps::write_error_png(out, &frame, case.truth(), 0.1))
+                .file(&file, |out| maps::write_error_png(out, &frame, truth, 0.1))
                 .map_err(|e| output_failure(&e))?;
+        }
+        if args.budget {
+            let title = format!("{name}, {frames} frames, {}", line.method);
+            budgets.push((title, budget::budget(&frame, truth)));
         }
         lines.push(line);
         Ok::<(), Failure>(())
@@ -122,6 +133,15 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         folder.commit().map_err(|e| output_failure(&e))?;
     }
     spinner.finish_and_clear();
-    output.result(&tables::to_text(&lines), &json!({ "seed": args.seed, "lines": lines }));
+    let mut text = tables::to_text(&lines);
+    for (title, classes) in &budgets {
+        text += &format!("\n{title}\n{}", budget::to_text(classes));
+    }
+    let budgets: Vec<_> = budgets
+        .iter()
+        .map(|(title, classes)| json!({ "line": title, "classes": classes }))
+        .collect();
+    let json = json!({ "seed": args.seed, "lines": lines, "budgets": budgets });
+    output.result(&text, &json);
     Ok(())
 }

@@ -80,6 +80,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     params.method = options.method;
     params.shape = options.shape;
     params.advanced.threads = options.threads;
+    params.advanced.settle_steps = !options.keep_steps;
     let candidates = params.disparity.max_px - params.disparity.min_px + 1;
     let stack = RectifiedStack::new(rectifier, &pairs, Vec::new()).map_err(|e| failed(e.into()))?;
     let mut matcher = Matcher::new(params).map_err(|e| failed(e.into()))?;
