@@ -217,7 +217,7 @@ pub fn reconstruct(
     params.advanced.threads = options.threads;
     params.advanced.settle_steps = !options.keep_steps;
     let mut matcher = Matcher::new(params)?;
-    let matched = stack.matched(&mut matcher, 0..stack.len())?;
+    let mut matched = stack.matched(&mut matcher, 0..stack.len())?;
     watch.step("match");
 
     progress("reprojecting");
@@ -227,7 +227,7 @@ pub fn reconstruct(
             stack.rectifier.rectify_left(&raw, &mut canvas, &mut RectifyScratch::default())?;
             reproject::mean_intensity(&[&canvas])
         }
-        None => reproject::mean_intensity(&stack.left.iter().collect::<Vec<_>>()),
+        None => reproject::brightness(&mut matched, &stack.left.iter().collect::<Vec<_>>()),
     };
     let geometry = stack.rectifier.geometry();
     let frame = reproject::depth_frame(geometry, matched, intensity, stack.labels);
@@ -324,10 +324,10 @@ impl RectifiedStack {
         matcher: &mut Matcher,
         window: Range<usize>,
     ) -> Result<DepthFrame, MatchError> {
-        let matched = self.matched(matcher, window.clone())?;
+        let mut matched = self.matched(matcher, window.clone())?;
         let left: Vec<_> = self.left[window.clone()].iter().collect();
         let labels = self.labels.get(window).map(<[_]>::to_vec).unwrap_or_default();
-        let intensity = reproject::mean_intensity(&left);
+        let intensity = reproject::brightness(&mut matched, &left);
         Ok(reproject::depth_frame(self.rectifier.geometry(), matched, intensity, labels))
     }
 }

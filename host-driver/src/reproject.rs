@@ -149,6 +149,12 @@ pub(crate) fn point_cloud(frame: &DepthFrame, cloud: &mut PointCloud) {
     });
 }
 
+/// Brightness of the left camera over a window: the match's own where it has one, which is taken out of it,
+/// else that of the window's rectified frames.
+pub fn brightness(matched: &mut Matched, left: &[&Image<Sample>]) -> Image<u8> {
+    matched.brightness.take().unwrap_or_else(|| mean_intensity(left))
+}
+
 /// Brightness of the left camera over a window: the mean of its rectified frames.
 pub fn mean_intensity(left: &[&Image<Sample>]) -> Image<u8> {
     let Some(first) = left.first() else { return Image::new(0, 0, 0) };

@@ -147,6 +147,7 @@ fn a_frames_depth_and_cloud_agree_with_its_geometry() {
         zncc: Image::new(w, h, f32::NAN),
         at_newest: true,
         rate_px_per_s: Some(Image::new(w, h, f32::NAN)),
+        brightness: None,
         stages: Vec::new(),
     };
     let infinity = geometry.disparity_at_infinity_px() as f32;

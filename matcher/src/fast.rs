@@ -80,6 +80,11 @@ impl Fast {
         loop {
             let part = pace::newest(stack, frames);
             self.once(&part, out, &mut done);
+            if frames == all {
+                // Of all frames, however many are matched.
+                let brightness = out.brightness.get_or_insert_with(|| Image::new(0, 0, 0));
+                std::mem::swap(brightness, &mut self.maps.brightness);
+            }
             let rate = self.motion.found();
             if !self.params.motion || !in_order || all <= FRAMES_MIN {
                 return;
@@ -147,7 +152,7 @@ impl Fast {
         }
         let disparity = &mut out.disparity_px;
         let zncc_min = self.params.zncc_min;
-        let DenseMaps { first_px, second_px, zncc } = &mut self.maps;
+        let DenseMaps { first_px, second_px, zncc, .. } = &mut self.maps;
         match self.params.shape {
             ShapeFunction::First => accept(first_px, zncc_min, zncc, disparity),
             ShapeFunction::Second => accept(second_px, zncc_min, zncc, disparity),
@@ -253,10 +258,14 @@ fn ends(mask: &[u8]) -> (usize, usize) {
 /// Disparities with a counterpart in the columns `from..to` of the right row, where `left` is set.
 #[inline(always)]
 fn begin_loop(row: &[i16], left: Option<&[u8]>, (from, to): (i32, i32), start: &mut [f32]) {
-    for (x, (start, &d)) in (0i32..).zip(start.iter_mut().zip(row)) {
-        let at = x - i32::from(d);
+    // By index: a counter zipped with slices is not vectorised.
+    let n = start.len();
+    let row = &row[..n];
+    for x in 0..n {
+        let d = row[x];
+        let at = x as i32 - i32::from(d);
         let seen = (d != INVALID) & (at >= from) & (at < to);
-        *start = if seen { f32::from(d) } else { f32::NAN };
+        start[x] = if seen { f32::from(d) } else { f32::NAN };
     }
     if let Some(left) = left {
         for (start, &seen) in start.iter_mut().zip(left) {

@@ -45,7 +45,7 @@ fn popcount(level: Level) -> f64 {
     let left: Vec<u64> = (0..PIXELS).map(word).collect();
     let right: Vec<u64> = (0..PIXELS + CANDIDATES).map(|i| word(i + 7)).collect();
     let mut shifts = Shifts::default();
-    shifts.extend(0..CANDIDATES as i32);
+    shifts.fill(0, CANDIDATES);
     let mut best = vec![0; PIXELS];
     fastest((PIXELS * CANDIDATES) as f64, || {
         best_candidates(level, black_box(&left), &right, CANDIDATES, &shifts, &mut best);

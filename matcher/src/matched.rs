@@ -27,6 +27,9 @@ pub struct Matched {
     /// Disparity's rate in px per second, zero where nothing moves significantly and NaN where the
     /// disparity is; `None` where motion is not estimated or the stack has no times.
     pub rate_px_per_s: Option<Image<f32>>,
+    /// Mean of the left images in grey levels of 8 bits, where the method has it at hand: with
+    /// [`crate::Method::Dense`].
+    pub brightness: Option<Image<u8>>,
     /// Time of each stage, in order.
     pub stages: Vec<StageTime>,
 }
@@ -39,6 +42,7 @@ impl Default for Matched {
             zncc: Image::new(0, 0, f32::NAN),
             at_newest: false,
             rate_px_per_s: None,
+            brightness: None,
             stages: Vec::new(),
         }
     }

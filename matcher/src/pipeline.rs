@@ -150,6 +150,7 @@ impl Matcher {
             zncc,
             at_newest: false,
             rate_px_per_s: None,
+            brightness: None,
             stages: clock.stages,
         }
     }
@@ -167,7 +168,9 @@ impl Matcher {
         let (mut disparity_px, mut zncc) = (field.disparity_px(), field.zncc());
         if params.shape == ShapeFunction::Auto {
             let first_px = field.first_order_px(prepared, map, params, *level);
-            let mut maps = DenseMaps { first_px, second_px: disparity_px.clone(), zncc };
+            let brightness = Image::new(0, 0, 0);
+            let second_px = disparity_px.clone();
+            let mut maps = DenseMaps { first_px, second_px, zncc, brightness };
             order.choose(level.usable(), params.zncc_min, &mut maps, &mut disparity_px);
             zncc = maps.zncc;
             clock.stage("order");
@@ -177,7 +180,14 @@ impl Matcher {
             *z = if d.is_nan() { f32::NAN } else { *z };
         }
         clock.stage("outlier");
-        Matched { disparity_px, zncc, at_newest: false, rate_px_per_s: None, stages: clock.stages }
+        Matched {
+            disparity_px,
+            zncc,
+            at_newest: false,
+            rate_px_per_s: None,
+            brightness: None,
+            stages: clock.stages,
+        }
     }
 }
 

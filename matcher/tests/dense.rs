@@ -279,6 +279,20 @@ fn black_saturated_and_unequal_input_gives_nothing_or_an_error() {
 }
 
 #[test]
+fn brightness_is_the_mean_of_all_left_images() {
+    for frames in [1, 4, 10] {
+        let scene = Scene::benchmark(150, 90, frames, 20.0).render();
+        let found = run(&scene, params(Method::Dense, ShapeFunction::First));
+        let brightness = found.brightness.unwrap();
+        for (i, &got) in brightness.as_slice().iter().enumerate() {
+            let sum: f64 = scene.left.iter().map(|image| f64::from(image.as_slice()[i])).sum();
+            let want = (sum / (64.0 * frames as f64)).clamp(0.0, 255.0);
+            assert!((f64::from(got) - want).abs() < 0.6, "{frames} {i}: {got}, {want}");
+        }
+    }
+}
+
+#[test]
 fn masked_pixels_are_invalid() {
     let scene = slanted(true).render();
     let mut left_mask = Image::new(200, 110, 1u8);

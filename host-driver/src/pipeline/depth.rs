@@ -181,10 +181,10 @@ impl DepthEngine {
             right_mask: Some(self.rectifier.right_mask()),
             times_s: times_s.as_deref(),
         };
-        let matched = self.matcher.match_stack(&stack)?;
+        let mut matched = self.matcher.match_stack(&stack)?;
         let intensity = match &self.texture {
             Some(texture) => reproject::mean_intensity(&[texture]),
-            None => reproject::mean_intensity(&left),
+            None => reproject::brightness(&mut matched, &left),
         };
         let labels = if self.with_labels { labels } else { Vec::new() };
         let mut frame =

@@ -13,7 +13,7 @@ use crate::{Image, Level, lanes::vectorised, parallel::PerThread};
 /// An outlier that matches better than its neighbours' disparity by more bits stays: a thin object.
 const THIN_BITS: u32 = 5;
 /// Left pixels this near may share a right pixel: a surface seen at a slant.
-const SHARED_PX: usize = 2;
+const SHARED_PX: u16 = 2;
 
 /// Rows of a task.
 const BAND: usize = 16;
@@ -26,6 +26,8 @@ pub(crate) struct Rows {
     median: Vec<i16>,
     suspect: Vec<u8>,
     claims: Vec<u32>,
+    counterpart: Vec<u32>,
+    owner: Vec<u16>,
 }
 
 /// Replaces outliers of `map` by the median of their 3x3 neighbours, into `out`.
@@ -113,8 +115,16 @@ fn settle_loop(
 #[inline(always)]
 fn settle(median: i16, bits: impl Fn(i32) -> Option<u32>, disparity: &mut i16, cost: &mut u8) {
     let middle = i32::from(median);
-    let near = (-1..=1).filter_map(|o| Some((bits(middle + o)?, middle + o)));
-    let around = if median == INVALID { None } else { near.min() };
+    // In a loop, which is compiled with the caller's instructions: iterators' closures are not always.
+    let mut around: Option<(u32, i32)> = None;
+    for d in middle - 1..=middle + 1 {
+        let here = if median == INVALID { None } else { bits(d) };
+        if let Some(bits) = here
+            && around.is_none_or(|(least, _)| bits < least)
+        {
+            around = Some((bits, d));
+        }
+    }
     let own = if *disparity == INVALID { u32::MAX } else { u32::from(*cost) };
     match around {
         Some((bits, d)) if bits <= own.saturating_add(THIN_BITS) => {
@@ -182,35 +192,65 @@ fn median(v: [i16; 9]) -> i16 {
 
 /// The left-right check: a right pixel belongs to the left pixel that matches it best; others that
 /// claim it from farther away are occluded or wrong, and become invalid.
-pub(crate) fn left_right(map: &mut CoarseMap, rows: &PerThread<Rows>) {
+pub(crate) fn left_right(level: Level, map: &mut CoarseMap, rows: &PerThread<Rows>) {
     let width = map.disparity.width();
     map.disparity
         .as_mut_slice()
         .par_chunks_mut(width * BAND)
         .zip(map.cost.as_slice().par_chunks(width * BAND))
         .for_each(|(disparity, cost)| {
-            rows.with(|Rows { claims, .. }| {
-                claims.resize(width, u32::MAX);
+            rows.with(|Rows { claims, counterpart, owner, .. }| {
+                counterpart.resize(width, 0);
+                owner.resize(width, 0);
                 for (disparity, cost) in disparity.chunks_mut(width).zip(cost.chunks(width)) {
-                    claims.fill(u32::MAX);
-                    let counterpart = |x: usize, d: i16| (x as i32 - i32::from(d)) as usize;
-                    for (x, (&d, &c)) in disparity.iter().zip(cost).enumerate() {
-                        if d != INVALID {
-                            let claim = &mut claims[counterpart(x, d)];
-                            *claim = (*claim).min(u32::from(c) << 16 | x as u32);
-                        }
+                    vectorised!(
+                        level,
+                        counterpart_loop(
+                            disparity: &[i16] = disparity,
+                            counterpart: &mut [u32] = counterpart,
+                        )
+                    );
+                    // One more, which those without a disparity claim.
+                    claims.clear();
+                    claims.resize(width + 1, u32::MAX);
+                    for ((x, &at), &c) in (0u32..).zip(counterpart.iter()).zip(cost) {
+                        let claim = &mut claims[at as usize];
+                        *claim = (*claim).min(u32::from(c) << 16 | x);
                     }
-                    for (x, d) in disparity.iter_mut().enumerate() {
-                        if *d != INVALID {
-                            let owner = (claims[counterpart(x, *d)] & 0xFFFF) as usize;
-                            if owner.abs_diff(x) > SHARED_PX {
-                                *d = INVALID;
-                            }
-                        }
+                    for (owner, &at) in owner.iter_mut().zip(counterpart.iter()) {
+                        *owner = claims[at as usize] as u16;
                     }
+                    vectorised!(
+                        level,
+                        owner_loop(owner: &[u16] = owner, disparity: &mut [i16] = disparity)
+                    );
                 }
             });
         });
+}
+
+/// The right pixel of each disparity, and the row's width where there is none.
+#[inline(always)]
+fn counterpart_loop(disparity: &[i16], counterpart: &mut [u32]) {
+    // By index: a counter zipped with slices is not vectorised.
+    let n = disparity.len();
+    let counterpart = &mut counterpart[..n];
+    for x in 0..n {
+        let d = disparity[x];
+        let at = (x as i32 - i32::from(d)) as u32;
+        counterpart[x] = if d == INVALID { n as u32 } else { at };
+    }
+}
+
+/// Takes the disparity of those whose right pixel has an owner farther away.
+#[inline(always)]
+fn owner_loop(owner: &[u16], disparity: &mut [i16]) {
+    let n = disparity.len();
+    let owner = &owner[..n];
+    for x in 0..n {
+        let far = owner[x].abs_diff(x as u16) > SHARED_PX;
+        disparity[x] = if far { INVALID } else { disparity[x] };
+    }
 }
 
 #[cfg(test)]
@@ -238,7 +278,7 @@ mod tests {
         map.disparity.set(9, 0, 6);
         map.cost.set(9, 0, 2);
         let mut rows = PerThread::default();
-        left_right(&mut map, rows.ready());
+        left_right(Level::best(), &mut map, rows.ready());
         assert_eq!(map.disparity.get(4, 0), Some(INVALID));
         assert_eq!(map.disparity.get(9, 0), Some(6));
     }

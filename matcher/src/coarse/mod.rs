@@ -97,7 +97,7 @@ impl Coarse {
         self.search.run(&scene, &mut self.raw);
         let rows = self.rows.ready();
         clean::replace_outliers(self.level, &self.left, &self.right, &self.raw, rows, map);
-        clean::left_right(map, rows);
+        clean::left_right(self.level, map, rows);
     }
 
     /// What [`Coarse::search`] is measured against: every candidate for every pixel.

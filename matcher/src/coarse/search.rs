@@ -188,10 +188,9 @@ fn seed_row(scene: &Scene<'_>, y: usize, s: &mut Scratch, seeds: &mut [i16]) {
         let to = max.min(x + reach);
         let mut winner = [u64::MAX; BLOCK];
         for (parity, row) in [(0, &s.even), (1, &s.odd)] {
-            s.shifts.clear();
             let first = from + (from - parity).rem_euclid(2);
-            let shift = |d: i64| ((d + parity) / 2) as i32;
-            s.shifts.extend((first..=to).step_by(2).map(shift));
+            let count = if first <= to { (to - first) / 2 + 1 } else { 0 };
+            s.shifts.fill(((first + parity) / 2) as i32, count as usize);
             let origin = MARGIN / 2 + block;
             best_candidates(
                 scene.level,
@@ -272,6 +271,10 @@ fn search_unsure(scene: &Scene<'_>, s: &mut Scratch, out: &mut Band<'_>) {
         let mut ready = false;
         for (block, _) in s.unsure.iter().enumerate().filter(|(_, unsure)| **unsure > 0) {
             let x = block * BLOCK;
+            let any = costs[x..].iter().take(BLOCK).fold(0, |most, c| most.max(*c));
+            if u32::from(any) <= UNSURE_COST {
+                continue;
+            }
             // Rows in turn look at even and at odd columns: a wire aslant may lie on one kind alone.
             let columns = (row / 2 % 2..BLOCK.min(out.width - x)).step_by(2);
             let unsure = |column: &usize| {
@@ -310,22 +313,19 @@ impl Free {
     /// Takes the row's matches.
     fn fill(&mut self, scene: &Scene<'_>, y: usize, disparities: &[i16], costs: &[u8]) {
         let width = disparities.len();
+        // One place more, for those that take none.
+        self.taken.clear();
         match scene.right_mask {
-            Some(mask) => {
-                self.taken.clear();
-                self.taken.extend(mask.row(y).iter().map(|seen| u8::from(*seen == 0)));
-            }
-            None => {
-                self.taken.clear();
-                self.taken.resize(width, 0);
-            }
+            Some(mask) => self.taken.extend(mask.row(y).iter().map(|seen| u8::from(*seen == 0))),
+            None => self.taken.resize(width, 0),
         }
-        for (x, (&d, &cost)) in disparities.iter().zip(costs).enumerate() {
-            if cost <= TAKEN_COST {
-                // Only disparities with a counterpart inside the image have a cost.
-                self.taken[(x as i32 - i32::from(d)) as usize] = 1;
-            }
+        self.taken.push(0);
+        for ((x, &d), &cost) in (0i32..).zip(disparities).zip(costs) {
+            // Only disparities with a counterpart inside the image have a cost.
+            let at = if cost <= TAKEN_COST { (x - i32::from(d)) as usize } else { width };
+            self.taken[at] = 1;
         }
+        self.taken.truncate(width);
         self.descriptors.resize(width, 0);
         self.columns.resize(width, 0);
         self.before.resize(width + 1, 0);

@@ -64,13 +64,16 @@ pub struct DenseMaps {
     pub second_px: Image<f32>,
     /// ZNCC of the window.
     pub zncc: Image<f32>,
+    /// Mean of the left images in grey levels of 8 bits.
+    pub brightness: Image<u8>,
 }
 
 impl DenseMaps {
     /// Empty maps.
     pub fn new(width: usize, height: usize) -> Self {
         let map = || Image::new(width, height, f32::NAN);
-        Self { first_px: map(), second_px: map(), zncc: map() }
+        let brightness = Image::new(width, height, 0);
+        Self { first_px: map(), second_px: map(), zncc: map(), brightness }
     }
 }
 
@@ -105,6 +108,9 @@ impl DenseFit {
         let (width, height) = (stack.width(), stack.height());
         if (out.first_px.width(), out.first_px.height()) != (width, height) {
             *out = DenseMaps::new(width, height);
+        }
+        if (out.brightness.width(), out.brightness.height()) != (width, height) {
+            out.brightness = Image::new(width, height, 0);
         }
         self.run(stack, start, step, None, out);
     }
@@ -164,15 +170,18 @@ impl DenseFit {
             Some(_) => BAND,
         };
         let rows = width * band_rows;
-        let DenseMaps { first_px, second_px, zncc } = out;
+        let DenseMaps { first_px, second_px, zncc, brightness } = out;
         first_px
             .as_mut_slice()
             .par_chunks_mut(rows)
             .zip(second_px.as_mut_slice().par_chunks_mut(rows))
             .zip(zncc.as_mut_slice().par_chunks_mut(rows))
+            .zip(brightness.as_mut_slice().par_chunks_mut(rows))
             .enumerate()
-            .for_each(|(band, ((first, second), zncc))| {
-                let mut out = Output { first, second, zncc };
+            .for_each(|(band, (((first, second), zncc), brightness))| {
+                // Fits made anew leave it as it is.
+                let brightness = again.is_none().then_some(brightness);
+                let mut out = Output { first, second, zncc, brightness };
                 tiles.with(|tile| {
                     for (from, to) in columns(width, band, again.map(|(_, blocks)| blocks)) {
                         let strips = (to - from).div_ceil(STRIP);

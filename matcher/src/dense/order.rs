@@ -97,7 +97,7 @@ impl OrderChoice {
         let (width, height) = (maps.first_px.width(), maps.first_px.height());
         let sigma = self.sigma(maps);
         let bands = self.bands.ready();
-        let DenseMaps { first_px, second_px, zncc } = maps;
+        let DenseMaps { first_px, second_px, zncc, .. } = maps;
         out.as_mut_slice()
             .par_chunks_mut(width * BAND)
             .zip(zncc.as_mut_slice().par_chunks_mut(width * BAND))

@@ -50,6 +50,8 @@ pub(crate) struct Output<'a> {
     pub first: &'a mut [f32],
     pub second: &'a mut [f32],
     pub zncc: &'a mut [f32],
+    /// Mean of the left images' grey values, where it is wanted.
+    pub brightness: Option<&'a mut [u8]>,
 }
 
 /// Padded rows by image row, the last `depth` of them kept.
@@ -207,9 +209,10 @@ impl Tile {
             ring.resize(stride, 3 * radius + 1);
         }
         self.s_used.resize(stride, 4 * radius + 1);
-        for ring in [&mut self.s, &mut self.l, &mut self.ll] {
+        for ring in [&mut self.s, &mut self.ll] {
             ring.resize(stride, window);
         }
+        self.l.resize(stride, 4 * radius + 1);
         // Window sums slide: the row that leaves is one behind the window.
         for ring in [&mut self.l_used, &mut self.ll_used] {
             ring.resize(stride, window + 1);
@@ -283,6 +286,17 @@ impl Tile {
                     (&mut *out.zncc, &self.zncc, 0.0),
                     (&mut *out.second, &self.fit[1], job.origin),
                 ];
+                if let Some(to) = &mut out.brightness {
+                    vectorised!(
+                        job.level,
+                        brightness_loop(
+                            light: &[f32] = &self.l.row(y4)[columns.clone()],
+                            // Sums over the frames of sixteenths.
+                            scale: f32 = 1.0 / (16.0 * job.frames as f32),
+                            to: &mut [u8] = &mut to[from + x_from..from + x_to],
+                        )
+                    );
+                }
                 let count = if job.fits == Fits::First { 2 } else { 3 };
                 for (to, ring, origin) in maps.into_iter().take(count) {
                     vectorised!(
@@ -530,6 +544,13 @@ impl Tile {
 fn finish_loop(values: &[f32], valid: &[f32], origin: f32, to: &mut [f32]) {
     for ((to, v), valid) in to.iter_mut().zip(values).zip(valid) {
         *to = if *valid > 0.5 { v + origin } else { f32::NAN };
+    }
+}
+
+#[inline(always)]
+fn brightness_loop(light: &[f32], scale: f32, to: &mut [u8]) {
+    for (to, light) in to.iter_mut().zip(light) {
+        *to = (light * scale + 0.5) as u8;
     }
 }
 

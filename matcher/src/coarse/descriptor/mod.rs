@@ -135,17 +135,13 @@ fn describe_band(
     stride: usize,
     out: &mut [u64],
 ) {
-    let (width, height) = (images[0].width(), images[0].height());
+    let width = images[0].width();
     let reach = tests.iter().map(Test::reach).max().unwrap_or(0);
     // The columns where no test leaves the image, in whole blocks. All but the first and the last
     // begin at a multiple of the block, where loads are aligned in images of such a width.
     let inner = if width >= 2 * reach + BLOCK { width - 2 * reach } else { 0 };
     let count = if inner == 0 { 0 } else { width.div_ceil(BLOCK) };
     let at_block = |b: usize| (b * BLOCK).saturating_sub(reach).min(inner - BLOCK);
-    let band = out.len() / stride;
-    let tables: [Rows<'_>; BAND] = std::array::from_fn(|i| {
-        rows_of(images, tests, (y0 + i.min(band - 1)).min(height - 1), reach, inner)
-    });
     let edges: [usize; 2] = if count == 0 { [width, width] } else { [reach, width - reach] };
     let strips = count.div_ceil(STRIP).max(width.div_ceil(BLOCK * STRIP) * usize::from(count == 0));
     for strip in 0..strips {
@@ -167,7 +163,8 @@ fn describe_band(
             if !blocks.is_empty() {
                 let at = blocks.clone().map(at_block);
                 let out = &mut out[reach..][..inner];
-                let (rows, mean) = (&tables[i], &mean[reach.saturating_sub(columns.start)..]);
+                let rows = &rows_of(images, tests, y0 + i, reach, inner);
+                let mean = &mean[reach.saturating_sub(columns.start)..];
                 let begin = columns.start.saturating_sub(reach);
                 match level {
                     // SAFETY: trusted levels are the processor's; rows and `out` are `inner` long,

@@ -23,6 +23,12 @@ impl Shifts {
         self.0.clear();
     }
 
+    /// Takes `count` candidates from `first` on instead of what there is.
+    pub(crate) fn fill(&mut self, first: i32, count: usize) {
+        self.0.clear();
+        self.0.extend(first..first + count as i32);
+    }
+
     /// Adds a candidate.
     ///
     /// # Panics
@@ -38,6 +44,7 @@ impl Shifts {
     }
 }
 
+#[cfg(test)]
 impl Extend<i32> for Shifts {
     fn extend<I: IntoIterator<Item = i32>>(&mut self, shifts: I) {
         shifts.into_iter().for_each(|shift| self.push(shift));

@@ -100,7 +100,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
             .and_then(|()| stack.rectifier.rectify_right(&newest.right, &mut right, &mut scratch));
         rectified.map_err(|e| failed(e.into()))?;
         watch.step("rectify");
-        let matched = stack.matched(&mut matcher, 0..stack.len()).map_err(|e| failed(e.into()))?;
+        let mut matched =
+            stack.matched(&mut matcher, 0..stack.len()).map_err(|e| failed(e.into()))?;
         watch.step("match");
         let inner: Vec<Step> = matched
             .stages
@@ -112,7 +113,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
             })
             .collect();
         let lefts: Vec<_> = stack.left.iter().collect();
-        let intensity = reproject::mean_intensity(&lefts);
+        let intensity = reproject::brightness(&mut matched, &lefts);
         let frame =
             reproject::depth_frame(stack.rectifier.geometry(), matched, intensity, Vec::new());
         watch.step("reproject");
