@@ -17,9 +17,14 @@ pub(crate) struct Window<'a> {
     pub q: &'a [&'a [f32]],
     /// Disparity that tells the surfaces apart; NaN where invalid.
     pub w: &'a [&'a [f32]],
-    /// Largest difference from the centre's disparity.
+    /// Largest difference from the centre's disparity, continued with the slope there if `sloped`.
     pub limit: f32,
+    /// Whether `w` has fractions of a pixel, so that it has slopes.
+    pub sloped: bool,
 }
+
+/// Pixels over which the slope is taken, to the side where it is less: on the other there may be a step.
+const SLOPE_REACH: usize = 2;
 
 /// Overwrites the disparities of the pixels where `flagged` (an unpadded row) is not zero.
 #[allow(clippy::too_many_arguments)]
@@ -247,12 +252,32 @@ unsafe fn sums<V: Lanes, const K: usize, const L: usize>(
     // SAFETY: the caller's promise, here and below.
     let load = |row: &[f32], at: usize| unsafe { V::load(row.as_ptr().add(at)) };
     let centre = load(window.w[radius], i);
+    let (mut slope_x, mut slope_y) = (zero, zero);
+    if window.sloped {
+        let side = |other: V| {
+            let slope = other.sub(centre).mul(V::splat(1.0 / SLOPE_REACH as f32));
+            // Infinite where nothing is known.
+            V::select(slope.abs().lt(V::splat(f32::INFINITY)), slope, V::splat(f32::INFINITY))
+        };
+        let less = |ahead: V, behind: V| {
+            let behind = zero.sub(behind);
+            let slope = V::select(ahead.abs().lt(behind.abs()), ahead, behind);
+            V::select(slope.abs().lt(V::splat(f32::INFINITY)), slope, zero)
+        };
+        let (row, reach) = (window.w[radius], SLOPE_REACH);
+        slope_x = less(side(load(row, i + reach)), side(load(row, i - reach)));
+        let (below, above) = (window.w[radius + reach], window.w[radius - reach]);
+        slope_y = less(side(load(below, i)), side(load(above, i)));
+    }
     let (mut s, mut q) = ([[zero; K]; K], [[zero; L]; L]);
     for row in 0..2 * radius + 1 {
         let (mut sh, mut qh) = ([zero; K], [zero; L]);
+        let offset = |at: usize| V::splat(at as f32 - radius as f32);
+        let beside = slope_y.mul_add(offset(row), centre);
         for column in 0..2 * radius + 1 {
             let at = i - radius + column;
-            let near = load(window.w[row], at).sub(centre).abs().lt(limit);
+            let continued = slope_x.mul_add(offset(column), beside);
+            let near = load(window.w[row], at).sub(continued).abs().lt(limit);
             let sv = V::select(near, load(window.s[row], at), zero);
             let qv = V::select(near, load(window.q[row], at), zero);
             for k in 0..K {

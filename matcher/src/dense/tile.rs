@@ -501,7 +501,7 @@ impl Tile {
             around(&self.s_used, y, FINE_RADIUS, |s| {
                 around(&self.second.q, y, FINE_RADIUS, |q| {
                     around(&self.w1, y, FINE_RADIUS, |w| {
-                        let window = Window { s, q, w, limit: job.surface_px };
+                        let window = Window { s, q, w, limit: job.surface_px, sloped: true };
                         let rows = (first, &mut self.threes[..]);
                         fine_row(level, &window, &self.fine_powers, len, rows, second);
                     });
@@ -530,7 +530,7 @@ impl Tile {
         around(&self.s_used, y, r, |s| {
             around(&pass.q, y, r, |q| {
                 around(w, y, r, |w| {
-                    let window = Window { s, q, w, limit: job.surface_px };
+                    let window = Window { s, q, w, limit: job.surface_px, sloped: again };
                     let flagged = &self.flagged;
                     refit_row(level, &window, flagged, r, &self.powers, len, fits, &mut out);
                 });
