@@ -154,6 +154,15 @@ fn what_cannot_be_measured_is_refused_with_what_to_do() {
     let empty = write(&folder.path("empty.ply"), &[]);
     let wall: Vec<_> = points.iter().filter(|p| p.z > 1.19).copied().collect();
     let wall = write(&folder.path("wall.ply"), &wall);
+    let moved = |by: Vector3<f64>| points.iter().map(|p| p + by).collect::<Vec<_>>();
+    let away = write(&folder.path("away.ply"), &moved(Vector3::new(0.0, 0.0, 3.0)));
+    let tiny: Vec<_> = points.iter().map(|p| p * 1e-3).collect();
+    let tiny = write(&folder.path("tiny.ply"), &tiny);
+    let line: Vec<_> = (0..500).map(|k| Point3::new(f64::from(k) * 1e-3, 0.0, 1.0)).collect();
+    let line = write(&folder.path("line.ply"), &line);
+    let flat = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 1\nvertex 0 0 1\nvertex 0 0 1\n\
+                endloop\nendfacet\nendsolid a\n";
+    std::fs::write(folder.path("flat.stl"), flat).unwrap();
     for (arguments, code, says) in [
         (vec!["measure", "plane", &millimetres], 3, "--scale 0.001"),
         (vec!["measure", "plane", &nan], 3, "no usable points"),
@@ -169,6 +178,20 @@ fn what_cannot_be_measured_is_refused_with_what_to_do() {
         (vec!["measure", "circle", &cloud, "--near", "1", "--radius-mm", "5"], 2, "x,y,z"),
         (vec!["fuse", &cloud, &millimetres, "--out", "gone"], 3, "--scale"),
         (vec!["fuse", &cloud, "--out", "gone"], 2, ""),
+        (vec!["fuse", &cloud, &nan, "--out", "gone"], 3, "none of them finite"),
+        (vec!["fuse", &cloud, &line, "--out", "gone"], 3, "line.ply: its points make no surface"),
+        (vec!["fuse", &wall, &wall, "--out", "gone", "--start", "given"], 3, "slide"),
+        (
+            vec!["fuse", &cloud, &away, "--out", "gone", "--start", "given"],
+            3,
+            "away.ply is connected",
+        ),
+        (vec!["fuse", &cloud, &cloud, "--out", "gone", "--scale", "nan"], 2, "metres per unit"),
+        (vec!["measure", "plane", &tiny], 3, "too small"),
+        (vec!["measure", "plane", &line], 3, "on a line"),
+        (vec!["measure", "compare", &cloud, "--to", &away], 3, "do not overlap"),
+        (vec!["measure", "compare", &wall, "--to", &wall], 3, "slide"),
+        (vec!["measure", "compare", &cloud, "--to", "flat.stl"], 3, "flat.stl"),
         (vec!["fuse", &cloud, &wall, "--out", "gone", "--axis", "1"], 2, "turntable"),
     ] {
         let output = Command::new(env!("CARGO_BIN_EXE_stspp"))
@@ -181,5 +204,6 @@ fn what_cannot_be_measured_is_refused_with_what_to_do() {
         assert!(error.contains(says), "{arguments:?}: {error}");
     }
     assert!(!folder.path("gone").exists());
-    assert_eq!(folder.names(), ["a.ply", "empty.ply", "mm.ply", "nan.ply", "wall.ply"]);
+    let given = ["a.ply", "away.ply", "empty.ply", "flat.stl", "line.ply", "mm.ply", "nan.ply"];
+    assert_eq!(folder.names(), [&given[..], &["tiny.ply", "wall.ply"]].concat());
 }

@@ -93,6 +93,15 @@ pub enum FuseError {
         /// What it has to be.
         expected: &'static str,
     },
+    /// A view shows no surface.
+    #[error(
+        "{name}: its points make no surface that another view could be laid on (a line, a scatter, or \
+         all seen too aslant)"
+    )]
+    View {
+        /// The view.
+        name: String,
+    },
     /// A pair of views cannot be registered.
     #[error("{source_name} onto {target_name}: {source}")]
     Pair {

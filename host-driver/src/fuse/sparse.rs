@@ -63,7 +63,7 @@ impl Sparse {
     /// The sparse clouds of all views.
     ///
     /// # Errors
-    /// A view without enough good points.
+    /// [`FuseError::View`].
     pub fn of_all(
         views: &[View],
         params: &FuseParams,
@@ -73,11 +73,7 @@ impl Sparse {
             .iter()
             .map(|view| {
                 progress(format!("{}: spreading points", view.name));
-                Self::of(view, params).map_err(|source| FuseError::Pair {
-                    source_name: view.name.clone(),
-                    target_name: "the model".into(),
-                    source,
-                })
+                Self::of(view, params).map_err(|_| FuseError::View { name: view.name.clone() })
             })
             .collect()
     }

@@ -7,25 +7,39 @@ use nalgebra::{Point3, Vector3};
 #[non_exhaustive]
 pub enum UnitsError {
     /// No finite points.
-    #[error("{what} has no usable points: {given} given, all of them NaN or infinite")]
+    #[error(
+        "{what} has no usable points ({given} given, none of them finite): was anything measured, and is \
+         it the right file?"
+    )]
     Empty {
         /// Which cloud.
         what: String,
         /// Points given.
         given: usize,
     },
-    /// The extent fits no scene of this sensor.
+    /// Larger than any scene of this sensor.
     #[error(
-        "{what} spans {extent} units: as metres that is too {size} for this sensor; if it is in \
+        "{what} spans {extent} units: as metres that is too large for this sensor; if it is in \
          millimetres, give {option} 0.001 (inches: 0.0254)"
     )]
-    Extent {
+    Large {
         /// Which cloud.
         what: String,
         /// Diagonal of the bulk of the points.
         extent: f64,
-        /// "large" or "small".
-        size: &'static str,
+        /// The option that scales it.
+        option: &'static str,
+    },
+    /// Smaller than any scene of this sensor.
+    #[error(
+        "{what} spans {extent} units: as metres that is too small for this sensor; was {option} given \
+         for a cloud that is in metres already, or are all its points in one place?"
+    )]
+    Small {
+        /// Which cloud.
+        what: String,
+        /// Diagonal of the bulk of the points.
+        extent: f64,
         /// The option that scales it.
         option: &'static str,
     },
@@ -65,9 +79,13 @@ pub fn check(what: &str, points: &[Point3<f64>], option: &'static str) -> Result
     if EXTENTS_M.contains(&extent) || finite < 3 {
         return Ok(());
     }
-    let size = if extent > *EXTENTS_M.end() { "large" } else { "small" };
+    let large = extent > *EXTENTS_M.end();
     let extent = (extent * 1e6).round() / 1e6;
-    Err(UnitsError::Extent { what, extent, size, option })
+    Err(if large {
+        UnitsError::Large { what, extent, option }
+    } else {
+        UnitsError::Small { what, extent, option }
+    })
 }
 
 #[cfg(test)]
@@ -83,7 +101,8 @@ mod tests {
         let scaled = |by: f64| -> Vec<_> { metres.iter().map(|p| p * by).collect() };
         let large = check("a.ply", &scaled(1000.0), "--scale").unwrap_err().to_string();
         assert!(large.contains("a.ply") && large.contains("--scale 0.001"), "{large}");
-        assert!(check("a.ply", &scaled(1e-3), "--scale").is_err());
+        let small = check("a.ply", &scaled(1e-3), "--scale").unwrap_err();
+        assert!(matches!(small, UnitsError::Small { .. }), "{small}");
         // A stray far away does not make a scene large.
         let mut stray = metres.clone();
         stray.push(Point3::new(1e6, 0.0, 0.0));

@@ -162,6 +162,9 @@ fn parameters(args: &Args) -> Result<FuseParams, Failure> {
     if args.start != StartName::Turntable && (args.step_deg.is_some() || args.axis.is_some()) {
         return usage("--step-deg and --axis belong to --start turntable");
     }
+    if !(1e-6..=1e6).contains(&args.scale) {
+        return usage(&format!("--scale {}: expected metres per unit, such as 0.001", args.scale));
+    }
     if !(0.01..=1.0).contains(&args.overlap_min) {
         return usage("--overlap-min: expected a share from 0.01 to 1");
     }
@@ -200,7 +203,8 @@ fn view(path: &Path, region: &Region, args: &Args) -> Result<View, Failure> {
     let points: Vec<Point3<f64>> = cloud.points_left_m.iter().map(|p| p.cast()).collect();
     units::check(&name, &points, "--scale").map_err(|e| input(&e))?;
     View::new(name.clone(), &cloud).ok_or_else(|| {
-        input(&format!("{name}: {} points are too few for a view", cloud.len()))
+        let finite = points.iter().filter(|p| p.coords.iter().all(|c| c.is_finite())).count();
+        input(&format!("{name}: {finite} points are too few for a view, expected 100 or more"))
             .remedy("see --box, --depth-min, --depth-max")
     })
 }
@@ -212,6 +216,7 @@ fn fuse_failure(error: &FuseError) -> Failure {
         FuseError::Pair { .. } => {
             failure.remedy("do they overlap? see --start, --box, --overlap-min")
         }
+        FuseError::View { .. } => failure.remedy("see --box, --depth-min, --depth-max"),
         _ => failure,
     }
 }
