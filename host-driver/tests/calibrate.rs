@@ -82,12 +82,13 @@ fn uncertainties_cover_the_errors_of_seeded_trials() {
 
 #[test]
 fn every_poor_set_gets_its_own_warning() {
-    let board: Board = "charuco:8x6:40".parse().unwrap();
-    let sets = trials::poor_sets(&board, &mut || {}).unwrap();
-    assert!(sets.len() >= 10);
-    for set in sets {
-        println!("{}: {:?}", set.name, set.findings);
-        assert!(set.is_found(), "{}: {:?} {:?}", set.name, set.findings, set.error);
+    for board in ["charuco:8x6:40", "circles:10x8:36"] {
+        let sets = trials::poor_sets(&board.parse().unwrap(), &mut || {}).unwrap();
+        assert!(sets.len() >= 10);
+        for set in sets {
+            println!("{board}: {}: {:?}", set.name, set.findings);
+            assert!(set.is_found(), "{board}: {}: {:?} {:?}", set.name, set.findings, set.error);
+        }
     }
 }
 

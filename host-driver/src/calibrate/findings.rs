@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::coverage::{Coverage, GapKind};
-use super::detect::{Problem, Quality};
+use super::detect::{BLUR_MAX_PX, Problem, Quality};
 use super::observations::Observations;
 use super::solve::{Solution, ViewFit, rms};
 
@@ -11,9 +11,6 @@ use super::solve::{Solution, ViewFit, rms};
 const VIEWS_WISHED: usize = 10;
 /// Spread of the boards' tilt about each axis, in degrees, below which they are all alike.
 const TILT_SPREAD_MIN_DEG: f64 = 6.0;
-/// Blur of the edges, in px, above which images are out of focus or smeared: a sharp lens and the
-/// pixel's own square give 0.6 to 0.8.
-const BLUR_MAX_PX: f64 = 1.5;
 /// Share of the points of an image whose white may be cut off.
 const SATURATED_MAX: f64 = 0.05;
 /// Contrast of white and black, in grey values of 8 bits, below which images are too dark.
@@ -142,7 +139,10 @@ fn of_images(observations: &Observations, images: &[Images], found: &mut Vec<Fin
     );
     add(
         Kind::Blurred,
-        named(&|pair| any_quality(pair, &|q| q.blur_px > BLUR_MAX_PX)),
+        named(&|pair| {
+            any_quality(pair, &|q| q.blur_px > BLUR_MAX_PX)
+                || any_problem(pair, &|p| matches!(p, Problem::Blurred { .. }))
+        }),
         "are blurred: hold the board still, shorten the exposure, focus the lenses",
     );
     add(

@@ -1,6 +1,8 @@
 //! Boards of discs: dark spots, their outlines as ellipses, their grid, and the three hollow ones that
 //! tell where the board begins. A plain grid, without hollow discs, is taken when it is seen whole.
 
+use std::collections::BTreeMap;
+
 use nalgebra::Vector2;
 use rayon::prelude::*;
 use stspp_matcher::Image;
@@ -8,7 +10,7 @@ use stspp_matcher::Image;
 use super::gray::Gray;
 use super::lattice::{self, Cell, Lattice, Nearby};
 use super::refine::{self, Ellipse, Refined};
-use super::{Detection, Problem, Quality};
+use super::{BLUR_MAX_PX, Detection, Problem, Quality};
 use crate::calibrate::Board;
 use crate::calibrate::observations::Sighting;
 
@@ -20,6 +22,8 @@ const DARKER: f32 = 5.0;
 const AREA_PX: std::ops::Range<usize> = 24..20_000;
 /// Largest ratio of a spot's axes: a tilt of 70 degrees.
 const ELONGATION_MAX: f64 = 3.0;
+/// Discs in one line beside the board that make it another board.
+const LINE: usize = 4;
 /// Seeds from which a grid is grown.
 const SEEDS: usize = 16;
 
@@ -62,25 +66,43 @@ pub fn detect(gray: &Gray, board: &Board) -> Result<Detection, Problem> {
     if best.len() < 6 {
         return Err(Problem::NoBoard { corners: points.len() });
     }
-    let placement = placed(&spots, &points, &best, board)?;
+    let placement = match placed(&spots, &points, &best, board) {
+        // Out of focus the hollow discs fill up first.
+        Err(Problem::NoOrigin { hollow }) => {
+            let all: Vec<(usize, usize)> = best.values().map(|spot| (*spot, *spot)).collect();
+            let blur_px = Quality::of(refined(gray, &spots, &all).iter().map(|(_, r)| r)).blur_px;
+            let is_blurred = blur_px > BLUR_MAX_PX;
+            return Err(if is_blurred {
+                Problem::Blurred { blur_px }
+            } else {
+                Problem::NoOrigin { hollow }
+            });
+        }
+        placed => placed?,
+    };
     let inside: Vec<(usize, usize)> =
         best.iter().filter_map(|(cell, spot)| Some((placement.point(*cell)?, *spot))).collect();
     let strays = best.len() - inside.len();
-    if strays > inside.len() / 4 {
+    if strays > inside.len() / 4 || placement.has_line_beside(best.keys()) {
         return Err(Problem::OtherBoard { markers: strays });
     }
-    let refined: Vec<(usize, Refined)> = inside
-        .par_iter()
-        .filter_map(|&(point, spot)| {
-            let Spot { ellipse, dark, light, .. } = spots[spot];
-            Some((point, refine::disc(gray, ellipse, light, dark)?))
-        })
-        .collect();
+    let refined = refined(gray, &spots, &inside);
     let mut quality = Quality::of(refined.iter().map(|(_, r)| r));
     quality.strays = strays;
     let sightings =
         refined.into_iter().map(|(point, r)| Sighting { point, pixel: r.pixel }).collect();
     Ok(Detection { sightings, quality })
+}
+
+/// Exact outlines of spots, given with what they are to be called.
+fn refined(gray: &Gray, spots: &[Spot], wanted: &[(usize, usize)]) -> Vec<(usize, Refined)> {
+    wanted
+        .par_iter()
+        .filter_map(|&(point, spot)| {
+            let Spot { ellipse, dark, light, .. } = spots[spot];
+            Some((point, refine::disc(gray, ellipse, light, dark)?))
+        })
+        .collect()
 }
 
 /// Mean grey value of a window about each pixel, by an integral image.
@@ -229,11 +251,34 @@ struct Placement {
 impl Placement {
     /// Index of the board's point in a cell; `None` beside the board.
     fn point(&self, cell: Cell) -> Option<usize> {
-        let d = minus(cell, self.cell);
-        let column = self.column + d.0 * self.along.0 + d.1 * self.along.1;
-        let row = self.row + d.0 * self.down.0 + d.1 * self.down.1;
+        let (column, row) = self.place(cell);
         let inside = (0..self.columns).contains(&column) && (0..self.rows).contains(&row);
         inside.then(|| (row * self.columns + column) as usize)
+    }
+
+    /// Column and row of a cell, on the board or beside it.
+    fn place(&self, cell: Cell) -> (i32, i32) {
+        let d = minus(cell, self.cell);
+        (
+            self.column + d.0 * self.along.0 + d.1 * self.along.1,
+            self.row + d.0 * self.down.0 + d.1 * self.down.1,
+        )
+    }
+
+    /// Whether several discs stand in one line beside the board: then it is a larger one. Single spots
+    /// of a background may be anywhere.
+    fn has_line_beside<'a>(&self, cells: impl Iterator<Item = &'a Cell>) -> bool {
+        let mut beside: BTreeMap<(bool, i32), usize> = BTreeMap::new();
+        for cell in cells {
+            let (column, row) = self.place(*cell);
+            let is_in = [(0..self.columns).contains(&column), (0..self.rows).contains(&row)];
+            match is_in {
+                [true, false] => *beside.entry((true, row)).or_default() += 1,
+                [false, true] => *beside.entry((false, column)).or_default() += 1,
+                _ => {}
+            }
+        }
+        beside.values().any(|count| *count >= LINE)
     }
 }
 

@@ -16,6 +16,10 @@ use crate::RawImage;
 use gray::Gray;
 use refine::Refined;
 
+/// Blur of the edges, in px, above which images are out of focus or smeared: a sharp lens and the
+/// pixel's own square give 0.6 to 0.8.
+pub(super) const BLUR_MAX_PX: f64 = 1.5;
+
 /// Grey value, of 255, below which the brightest parts of an image are dark.
 const BRIGHT_MIN: u8 = 64;
 /// Grey value, of 255, at which white counts as cut off.
@@ -65,7 +69,7 @@ impl Quality {
 }
 
 /// Why an image gave no points.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Problem {
     /// No grid of corners or discs.
@@ -87,6 +91,12 @@ pub enum Problem {
     NoOrigin {
         /// Hollow discs found.
         hollow: usize,
+    },
+    /// Discs that are so blurred that hollow ones cannot be told from full ones.
+    #[error("the discs are blurred by {blur_px:.1} px")]
+    Blurred {
+        /// Width of their edges in px.
+        blur_px: f64,
     },
     /// The board is seen, or printed, mirrored.
     #[error("the board is mirrored")]
