@@ -45,6 +45,8 @@ const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 360.0;
 /// Left, top, right and bottom of the plot.
 const PLOT: [f64; 4] = [64.0, 34.0, 470.0, 312.0];
+/// Most ticks of the x axis: with more values than that it has round ones.
+const TICKS: usize = 8;
 const COLOURS: [&str; 8] =
     ["#1f6fb4", "#d1495b", "#2a9d5c", "#8a5fbf", "#e08e2b", "#3aa6b9", "#7a6a58", "#111111"];
 
@@ -100,8 +102,10 @@ impl Chart {
         let mut xs: Vec<f64> = all().map(|p| p.0).collect();
         xs.sort_unstable_by(f64::total_cmp);
         xs.dedup();
-        let every = xs.len().div_ceil(10).max(1);
-        for x in xs.iter().step_by(every) {
+        if xs.len() > TICKS {
+            xs = round_ticks(x0, x1);
+        }
+        for x in &xs {
             let _ = write!(
                 svg,
                 "<text x=\"{:.1}\" y=\"{}\" class=\"tick middle\">{x:.4}</text>",
@@ -150,10 +154,12 @@ impl Chart {
                 };
             }
             let y = PLOT[1] + 14.0 + 18.0 * k as f64;
+            // As the points are drawn: joined ones full, others hollow.
+            let fill = if series.joined { colour } else { "none" };
             let _ = write!(
                 svg,
-                "<rect x=\"{}\" y=\"{}\" width=\"10\" height=\"10\" fill=\"{colour}\"/>\
-                 <text x=\"{}\" y=\"{}\" class=\"key\">{}</text>",
+                "<rect x=\"{}\" y=\"{}\" width=\"9\" height=\"9\" fill=\"{fill}\" stroke=\"{colour}\" \
+                 stroke-width=\"2\"/><text x=\"{}\" y=\"{}\" class=\"key\">{}</text>",
                 PLOT[2] + 14.0,
                 y - 9.0,
                 PLOT[2] + 30.0,
@@ -165,9 +171,20 @@ impl Chart {
     }
 }
 
+/// Multiples of 1, 2 or 5 times a power of ten, at most [`TICKS`] of them.
+fn round_ticks(from: f64, to: f64) -> Vec<f64> {
+    let decade = 10_f64.powf(((to - from) / TICKS as f64).log10().floor());
+    let steps = [1.0, 2.0, 5.0, 10.0].map(|digit| digit * decade);
+    let fits = |step: &f64| (to - from) / step <= TICKS as f64;
+    let step = steps.into_iter().find(fits).unwrap_or(steps[3]);
+    let (first, last) = ((from / step).ceil() as i64, (to / step).floor() as i64);
+    (first..=last).map(|k| k as f64 * step).collect()
+}
+
 /// Takes the zeros off the number before the last tag.
 fn trim_zeros(svg: &mut String) {
     if let Some(tail) = svg.strip_suffix("</text>") {
+        // There always is a point: four digits are written.
         let kept = tail.trim_end_matches('0').trim_end_matches('.').to_owned();
         *svg = kept + "</text>";
     }
@@ -202,6 +219,13 @@ mod tests {
             svg.contains("a &lt; b") && svg.contains(">1.5</text>") && svg.contains(">0.05</text>")
         );
         assert!(!svg.contains("NaN") && !svg.contains("inf"));
+        // Many values have round ticks: 0, 10 ... 40, and none of their own.
+        let points = (0..10).map(|k| (4.63 * f64::from(k), 1.0 + f64::from(k))).collect();
+        let many = Series { points, ..series("ours", true) };
+        let svg = Chart { series: vec![many], ..chart.clone() }.to_svg();
+        assert!(
+            svg.contains(">10</text>") && svg.contains(">40</text>") && !svg.contains(">4.63<")
+        );
         let empty = Chart { series: Vec::new(), ..chart };
         assert!(empty.to_svg().ends_with("</svg>"));
     }

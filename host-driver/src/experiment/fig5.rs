@@ -29,7 +29,8 @@ pub fn run(studio: &mut Studio<'_>) -> Result<Section, ExperimentError> {
         "The paper fits planes to 50 % of the valid area of planar targets. Ours are matt planes that \
          fill the field; the fit takes the middle half. The simulated planes are flat to rounding and \
          the simulated calibration is exact: what remains is the matcher's noise, where the paper's \
-         figures also hold its targets' flatness and its calibration.",
+         figures also hold its targets' flatness and its calibration. Wrong matches are not left out: those \
+         that a single pattern leaves make its curve jump.",
     );
     // Planes of 2 m reach beyond it at the picture's edge, and those of 0.85 m come nearer.
     studio.depths(DepthRange { min_m: 0.75, max_m: 2.15 });

@@ -16,7 +16,7 @@ td.bad{color:#a3262f;font-weight:600}td.note{color:#555;font-size:.86rem}\
 .chart .grid{stroke:#e2e2e2}.chart text{font:12px system-ui,sans-serif;fill:#333}\
 .chart .title{font-weight:600;font-size:14px}.chart .end{text-anchor:end}.chart .middle{text-anchor:middle}\
 .pictures{display:grid;grid-template-columns:repeat(auto-fill,minmax(300px,1fr));gap:1rem;margin:1rem 0}\
-figure{margin:0}figure img{width:100%;height:auto;background:#0c0c0e}figcaption{font-size:.84rem;color:#444}";
+figure{margin:0}figure img{width:100%;height:300px;object-fit:contain;background:#0c0c0e}figcaption{font-size:.84rem;color:#444}";
 
 /// What stands above everything, in both reports.
 const ABOUT: &str = "The evaluation of the ST-SPP paper (Figures 2 to 8), repeated on the simulated \
@@ -44,7 +44,7 @@ pub fn html(sections: &[Section], made_by: &str) -> String {
             section.figure.name(),
             &section.figure.name()[3..],
             escaped(section.title),
-            escaped(&section.about),
+            with_code(&section.about),
             table(&section.rows)
         );
         for chart in &section.charts {
@@ -63,6 +63,16 @@ pub fn html(sections: &[Section], made_by: &str) -> String {
         page += "</div>";
     }
     page + "</body></html>\n"
+}
+
+/// Text for HTML, with what stands between backticks as code.
+fn with_code(text: &str) -> String {
+    let parts: Vec<String> = text.split('`').map(escaped).collect();
+    let coded = parts.iter().enumerate().map(|(k, part)| match k % 2 {
+        1 => format!("<code>{part}</code>"),
+        _ => part.clone(),
+    });
+    coded.collect()
 }
 
 /// How many comparisons there are, and which are not won.
@@ -173,7 +183,7 @@ mod tests {
 
     #[test]
     fn the_report_tells_better_from_worse_and_is_whole_in_itself() {
-        let mut section = Section::new(Figure::Fig5, "Planes", "a < b");
+        let mut section = Section::new(Figure::Fig5, "Planes", "a < b by `--c`");
         section.rows.push(Row::error_mm("RMS", Some(0.2), 0.1));
         section.rows.push(Row::error_mm("other RMS", Some(0.2), 0.3).note("because | of this"));
         section.rows.push(Row { good: Good::Large, ..Row::error_mm("share", Some(1.0), 2.0) });
@@ -181,7 +191,10 @@ mod tests {
         let page = html(&[section.clone()], "version 0");
         assert!(page.contains("2 of 3 printed figures are bettered"));
         assert!(page.contains("href=\"#fig5\">Figure 5</a>: other RMS"));
-        assert!(page.contains("a &lt; b") && page.contains("data:image/png;base64,AQID"));
+        assert!(
+            page.contains("a &lt; b by <code>--c</code>")
+                && page.contains("data:image/png;base64,AQID")
+        );
         assert!(!page.contains("http"), "nothing is fetched");
         let table = markdown(&[section], "version 0");
         assert!(
