@@ -174,6 +174,13 @@ impl Rig {
         self.cameras[index(camera)].sequence
     }
 
+    /// Whether an exposure of a camera is read out.
+    #[must_use]
+    pub fn is_ready(&self, camera: Camera) -> bool {
+        let now_ns = self.now_ns();
+        self.cameras[index(camera)].frames.front().is_some_and(|f| f.ready_ns <= now_ns)
+    }
+
     /// Takes the oldest exposure of a camera that is read out.
     pub fn take_ready(&mut self, camera: Camera) -> Option<Exposure> {
         let now_ns = self.now_ns();

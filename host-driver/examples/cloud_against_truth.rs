@@ -2,7 +2,8 @@
 //! computed elsewhere, such as in the machine of `cargo xtask e2e`.
 //!
 //! `cargo run --release --example cloud_against_truth -- CLOUD.ply 'sim:sphere?scale=2'` prints JSON:
-//! points, the part of them within 5 mm of the surface along their ray, and the RMS of those' errors.
+//! points, the part of them within 5 mm of the surface along their ray, the RMS of those' errors, and the
+//! median of their magnitudes, which the few points at depth steps do not move.
 
 use stspp::PointCloud;
 use stspp::sim::{SimOptions, SimSensor};
@@ -23,18 +24,24 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let truth = sim.world.truth();
     let origin = nalgebra::Vector3::zeros();
     let mut squares_mm2 = 0.0;
-    let mut within = 0_usize;
+    let mut errors_mm = Vec::new();
     for point in &cloud.points_left_m {
         let point = point.coords.cast::<f64>();
         let Some(surface) = truth.surface_along_ray(&origin, &point, 0) else { continue };
         let error_m = point.norm() - surface.point_left_m.norm();
         if error_m.abs() <= OUTLIER_M {
-            within += 1;
+            errors_mm.push((error_m * 1e3).abs());
             squares_mm2 += (error_m * 1e3).powi(2);
         }
     }
+    let within = errors_mm.len();
     let rms_mm = (squares_mm2 / within.max(1) as f64).sqrt();
     let part = within as f64 / cloud.len().max(1) as f64;
-    println!("{{\"points\": {}, \"within\": {part:.6}, \"rms_mm\": {rms_mm:.6}}}", cloud.len());
+    errors_mm.sort_unstable_by(f64::total_cmp);
+    let median_mm = errors_mm.get(within / 2).copied().unwrap_or(0.0);
+    println!(
+        "{{\"points\": {}, \"within\": {part:.6}, \"rms_mm\": {rms_mm:.6}, \"median_mm\": {median_mm:.6}}}",
+        cloud.len()
+    );
     Ok(())
 }

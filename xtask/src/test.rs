@@ -2,7 +2,7 @@
 //! one failed, so that one run shows all that is wrong.
 
 use crate::stage::{self, Outcome, Stage};
-use crate::{arrows, book, firmware, kernels, licences, workspace};
+use crate::{arrows, book, e2e, firmware, kernels, licences, workspace};
 use std::process::{Command, ExitCode};
 
 /// How much to test.
@@ -73,12 +73,15 @@ pub fn run(depth: Depth) -> ExitCode {
         }),
     ];
     let deeper: Vec<Stage> =
-        KERNELS.map(|(name, work)| stage::run(name, || full(depth, work))).into();
+        DEEPER.map(|(name, work)| stage::run(name, || full(depth, work))).into();
     summarise(&[stages, deeper].concat())
 }
 
 /// A stage's name and work.
 type Named = (&'static str, fn() -> Outcome);
+
+/// What needs Debian packages beyond the firmware's.
+const DEEPER: [Named; 4] = [("Linux guest", e2e::stage), KERNELS[0], KERNELS[1], KERNELS[2]];
 
 /// The matcher's kernels beyond their tests.
 const KERNELS: [Named; 3] = [

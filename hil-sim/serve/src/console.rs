@@ -85,7 +85,8 @@ impl Console {
             "short" => FrameFault::Short,
             _ => return None,
         };
-        self.faults[at].lock().unwrap_or_else(PoisonError::into_inner).push(fault);
+        // Cameras side by side are one: the left one.
+        self.faults.get(at)?.lock().unwrap_or_else(PoisonError::into_inner).push(fault);
         Some(())
     }
 

@@ -64,9 +64,12 @@ pub struct Simulated {
     /// Cameras with 1/SCALE of the pixels in each direction: 1, 2, 4, 8 or 16.
     #[arg(long, default_value_t = 1)]
     scale: usize,
-    /// Bits of a pixel: 8 as GREY, 10 or 12 as Y16.
-    #[arg(long, default_value_t = 8)]
-    bits: u8,
+    /// How the cameras send a pixel.
+    #[arg(long, value_enum, default_value_t = Format::Grey)]
+    format: Format,
+    /// One camera that sends both pictures side by side, instead of two.
+    #[arg(long)]
+    side_by_side: bool,
     /// What runs the controller.
     #[arg(long, value_enum, default_value_t = Mcu::F350)]
     mcu: Mcu,
@@ -77,6 +80,21 @@ pub struct Simulated {
     /// lost on a machine that is too slow, such as an emulated one.
     #[arg(long)]
     patient: bool,
+}
+
+/// How a pixel is sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// 8 bits.
+    Grey,
+    /// 10 bits in 16.
+    Y10,
+    /// 12 bits in 16.
+    Y12,
+    /// 12 bits, said to be 16.
+    Y16,
+    /// 8 bits of luma beside a byte of colour.
+    Yuyv,
 }
 
 /// What runs the simulated controller.
@@ -117,9 +135,17 @@ fn run(serve: &Serve) -> Result<(), Box<dyn std::error::Error>> {
     // The first line of the output is for programs.
     println!("{}", address.port());
     std::io::stdout().flush()?;
-    eprintln!("control interface 1-1, left camera 1-2, right camera 1-3 at {address}");
-    for bus_id in ["1-1", "1-2", "1-3"] {
-        eprintln!("  usbip --tcp-port {} attach -r {} -b {bus_id}", address.port(), address.ip());
+    let devices: &[(&str, &str)] = if serve.simulated.side_by_side {
+        &[("control interface", "1-1"), ("cameras side by side", "1-2")]
+    } else {
+        &[("control interface", "1-1"), ("left camera", "1-2"), ("right camera", "1-3")]
+    };
+    for (name, bus_id) in devices {
+        eprintln!(
+            "{name}: usbip --tcp-port {} attach -r {} -b {bus_id}",
+            address.port(),
+            address.ip()
+        );
     }
     let stop = server.stop_flag();
     std::thread::Builder::new().name("console".into()).spawn(move || {

@@ -22,7 +22,7 @@ use stspp_protocol::usb as ids;
 
 use crate::console::Console;
 use crate::pace::{self, Backlog};
-use crate::{Mcu, Simulated};
+use crate::{Format, Mcu, Simulated};
 
 /// Exposures that a camera keeps for a host that is slow: a few, as cameras do.
 const FRAMES_KEPT: usize = 8;
@@ -42,6 +42,8 @@ enum Control {
 pub struct Sensor {
     world: Arc<World>,
     bank: Arc<FrameBank>,
+    format: PixelFormat,
+    side_by_side: bool,
     control: Control,
     clock: Clock,
     backlog: Backlog,
@@ -56,11 +58,17 @@ impl Sensor {
         let (name, options) = simulated.scene.split_once('?').unwrap_or((&simulated.scene, ""));
         let options: Vec<(&str, &str)> =
             options.split('&').filter_map(|option| option.split_once('=')).collect();
-        if !matches!(simulated.scale, 1 | 2 | 4 | 8 | 16) || !matches!(simulated.bits, 8 | 10 | 12)
-        {
-            return Err("--scale is 1, 2, 4, 8 or 16, and --bits 8, 10 or 12".into());
+        if !matches!(simulated.scale, 1 | 2 | 4 | 8 | 16) {
+            return Err("--scale is 1, 2, 4, 8 or 16".into());
         }
-        let model = SensorModel::with_seed(simulated.seed).with_bits(simulated.bits);
+        let (format, bits) = match simulated.format {
+            Format::Grey => (PixelFormat::Grey, 8),
+            Format::Y10 => (PixelFormat::Y10, 10),
+            Format::Y12 => (PixelFormat::Y12, 12),
+            Format::Y16 => (PixelFormat::Y16, 12),
+            Format::Yuyv => (PixelFormat::Yuyv, 8),
+        };
+        let model = SensorModel::with_seed(simulated.seed).with_bits(bits);
         let model = if simulated.scale > 1 { model.scaled_down(simulated.scale) } else { model };
         let world = Arc::new(World::new(&SceneSpec::parse(name, &options)?, model)?);
         let (control, booted_ns) = control(simulated)?;
@@ -74,8 +82,9 @@ impl Sensor {
             }
             Unclocked::InProcess(device, serial) => Control::InProcess(device, serial),
         };
-        let bank = Arc::new(FrameBank::new(Arc::clone(&world)));
-        Ok(Self { world, bank, control, clock, backlog })
+        let bank = Arc::new(FrameBank::new(Arc::clone(&world), format));
+        let side_by_side = simulated.side_by_side;
+        Ok(Self { world, bank, format, side_by_side, control, clock, backlog })
     }
 
     /// Scene and cameras.
@@ -138,10 +147,20 @@ impl Sensor {
         };
         let mut exports = vec![Export::new(control)];
         let mut faults = Vec::new();
-        for (camera, cable) in CAMERAS.into_iter().zip(&cables[1..]) {
-            let eye = Eye::new(Arc::clone(&bench), Arc::clone(&self.bank), camera);
+        let eye = |camera| Eye::new(Arc::clone(&bench), Arc::clone(&self.bank), camera);
+        let (left, right) = (&model.left, &model.right);
+        let cameras = if self.side_by_side {
+            let both = Eye::both(Arc::clone(&bench), Arc::clone(&self.bank));
+            vec![(both, "cameras", left.width + right.width, left.height)]
+        } else {
+            vec![
+                (eye(Camera::Left), "left camera", left.width, left.height),
+                (eye(Camera::Right), "right camera", right.width, right.height),
+            ]
+        };
+        for ((eye, name, width, height), cable) in cameras.into_iter().zip(&cables[1..]) {
             faults.push(eye.faults());
-            let device = UvcCamera::new(description(camera, model), eye);
+            let device = UvcCamera::new(description(name, [width, height], self.format), eye);
             let port: Arc<Mutex<dyn UsbFunction>> =
                 Arc::new(Mutex::new(Plugged::new(device, cable.clone())));
             exports.push(Export::new(port));
@@ -170,19 +189,15 @@ fn control(simulated: &Simulated) -> Result<(Unclocked, u64), Box<dyn std::error
     Ok((Unclocked::Emulated(Box::new(controller)), booted_ns))
 }
 
-fn description(camera: Camera, model: &SensorModel) -> Description {
-    let (side, model) = match camera {
-        Camera::Left => ("left", &model.left),
-        Camera::Right => ("right", &model.right),
-    };
+fn description(name: &str, [width, height]: [usize; 2], format: PixelFormat) -> Description {
     Description {
         vendor_id: ids::VENDOR_ID,
         product_id: ids::PRODUCT_ID,
-        product: format!("stspp {side} camera"),
+        product: format!("stspp {name}"),
         serial: "SIMULATED".into(),
-        width: model.width as u16,
-        height: model.height as u16,
-        format: if model.bits <= 8 { PixelFormat::Grey } else { PixelFormat::Y16 },
+        width: width as u16,
+        height: height as u16,
+        format,
         interval_100ns: 10_000_000 / FRAMES_PER_SECOND,
     }
 }

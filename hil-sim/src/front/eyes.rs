@@ -10,9 +10,10 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::bench::Bench;
+use super::uvc::descriptors::PixelFormat;
 use super::uvc::payload::CLOCK_HZ;
 use super::uvc::{Frame, FrameSource, Settings};
-use crate::rig::Exposure;
+use crate::rig::{CAMERAS, Exposure};
 use crate::world::{Camera, LightInterval, LightSource, RawImage, World};
 
 /// Pictures with noise of their own that are kept for one light and exposure.
@@ -54,7 +55,7 @@ impl Key {
         Self { camera: exposure.camera, exposure_us, gain_percent, lights_us }
     }
 
-    fn render(&self, world: &World, seed: u64) -> Vec<u8> {
+    fn render(&self, world: &World, seed: u64) -> RawImage {
         let lights: Vec<_> = self
             .lights_us
             .iter()
@@ -62,31 +63,23 @@ impl Key {
             .collect();
         let gain = f64::from(self.gain_percent) / 100.0;
         let close_ns = self.exposure_us * 1000;
-        sent(&world.expose_with_gain(self.camera, 0, close_ns, &lights, gain, seed))
-    }
-}
-
-/// A picture as the camera sends it.
-fn sent(picture: &RawImage) -> Vec<u8> {
-    if picture.bits <= 8 {
-        picture.data.iter().map(|&v| v as u8).collect()
-    } else {
-        picture.data.iter().flat_map(|v| v.to_le_bytes()).collect()
+        world.expose_with_gain(self.camera, 0, close_ns, &lights, gain, seed)
     }
 }
 
 /// Pictures of a scene, kept where it stands still.
 pub struct FrameBank {
     world: Arc<World>,
+    format: PixelFormat,
     /// As they are sent, each with noise of its own.
     kept: Mutex<BTreeMap<Key, Vec<Arc<Vec<u8>>>>>,
 }
 
 impl FrameBank {
-    /// An empty bank.
+    /// An empty bank of pictures that are sent as `format`.
     #[must_use]
-    pub fn new(world: Arc<World>) -> Self {
-        Self { world, kept: Mutex::default() }
+    pub fn new(world: Arc<World>, format: PixelFormat) -> Self {
+        Self { world, format, kept: Mutex::default() }
     }
 
     /// Makes all pictures of an exposure beforehand, where the scene stands still.
@@ -104,9 +97,9 @@ impl FrameBank {
         if !self.world.is_still() {
             let gain = f64::from(gain_percent) / 100.0;
             let world = &self.world;
-            return sent(
-                &world.expose_with_gain(*camera, *open_ns, *close_ns, lights, gain, *open_ns),
-            );
+            let picture =
+                world.expose_with_gain(*camera, *open_ns, *close_ns, lights, gain, *open_ns);
+            return self.format.pack(&picture.data);
         }
         let variants = self.variants(&Key::of(exposure, gain_percent), *open_ns);
         let model = self.world.model();
@@ -134,7 +127,8 @@ impl FrameBank {
         if variants.len() < VARIANTS {
             // Rendered without the lock: the other camera goes on.
             let seed = seed.wrapping_mul(VARIANTS as u64).wrapping_add(variants.len() as u64);
-            variants.push(Arc::new(key.render(&self.world, seed)));
+            let picture = key.render(&self.world, seed);
+            variants.push(Arc::new(self.format.pack(&picture.data)));
             let mut kept = self.lock();
             if kept.len() >= KEYS && !kept.contains_key(key) {
                 kept.clear();
@@ -163,11 +157,12 @@ pub enum FrameFault {
     Short,
 }
 
-/// One of the sensor's cameras.
+/// One of the sensor's cameras, or both as one that sends their pictures side by side.
 pub struct Eye {
     bench: Arc<Bench>,
     bank: Arc<FrameBank>,
-    camera: Camera,
+    /// What a picture shows, from left to right.
+    cameras: Vec<Camera>,
     /// The camera's clock against the sensor's: offset in nanoseconds, drift in millionths.
     clock: (u64, i64),
     faults: Arc<Mutex<Vec<FrameFault>>>,
@@ -184,8 +179,14 @@ impl Eye {
             Camera::Left => (41_234_567_891, 37),
             Camera::Right => (7_345_678_912, -52),
         };
-        let faults = Arc::default();
-        Self { bench, bank, camera, clock, faults, again: None, lagging: None, lags: false }
+        let (cameras, faults) = (vec![camera], Arc::default());
+        Self { bench, bank, cameras, clock, faults, again: None, lagging: None, lags: false }
+    }
+
+    /// Both cameras as one, whose clock is the left one's.
+    #[must_use]
+    pub fn both(bench: Arc<Bench>, bank: Arc<FrameBank>) -> Self {
+        Self { cameras: CAMERAS.into(), ..Self::new(bench, bank, Camera::Left) }
     }
 
     /// Faults to come, the next frame's last.
@@ -202,26 +203,48 @@ impl Eye {
     }
 
     fn take(&mut self, settings: Settings) -> Option<Frame> {
-        let exposure = {
+        let exposures: Vec<Exposure> = {
             let mut rig = self.bench.rig();
             let longest_ns = u64::from(settings.exposure_us) * 1000;
-            rig.set_longest_exposure_ns(self.camera, Some(longest_ns));
-            rig.take_ready(self.camera)?
+            for camera in &self.cameras {
+                rig.set_longest_exposure_ns(*camera, Some(longest_ns));
+            }
+            if !self.cameras.iter().all(|camera| rig.is_ready(*camera)) {
+                return None;
+            }
+            self.cameras.iter().filter_map(|camera| rig.take_ready(*camera)).collect()
         };
-        let pixels = self.bank.picture(&exposure, settings.gain_percent);
-        let sof = self.bench.frame_number(exposure.open_ns);
-        Some(Frame { pixels, exposure_ticks: self.ticks(exposure.open_ns), sof })
+        let open_ns = exposures.first()?.open_ns;
+        let mut pictures: Vec<Vec<u8>> =
+            exposures.iter().map(|e| self.bank.picture(e, settings.gain_percent)).collect();
+        let pixels = match pictures.len() {
+            1 => pictures.swap_remove(0),
+            _ => side_by_side(&pictures, self.bank.world.model().left.height),
+        };
+        let sof = self.bench.frame_number(open_ns);
+        Some(Frame { pixels, exposure_ticks: self.ticks(open_ns), sof })
     }
+}
+
+/// Rows of all pictures, which have as many, one after the other.
+fn side_by_side(pictures: &[Vec<u8>], height: usize) -> Vec<u8> {
+    let row = |picture: &'_ Vec<u8>, y: usize| {
+        let bytes = picture.len() / height;
+        picture[y * bytes..][..bytes].to_vec()
+    };
+    (0..height).flat_map(|y| pictures.iter().flat_map(move |picture| row(picture, y))).collect()
 }
 
 impl FrameSource for Eye {
     fn start(&mut self) {
         (self.again, self.lagging, self.lags) = (None, None, false);
-        self.bench.rig().start_camera(self.camera);
+        let mut rig = self.bench.rig();
+        self.cameras.iter().for_each(|camera| rig.start_camera(*camera));
     }
 
     fn stop(&mut self) {
-        self.bench.rig().stop_camera(self.camera);
+        let mut rig = self.bench.rig();
+        self.cameras.iter().for_each(|camera| rig.stop_camera(*camera));
     }
 
     fn poll(&mut self, settings: Settings) -> Option<Frame> {

@@ -45,13 +45,13 @@ impl CameraPlan {
     /// Finds the cameras' nodes.
     ///
     /// # Errors
-    /// [`CameraError::NotFound`] when their number is neither one nor two.
+    /// [`CameraError::NotFound`] when their number is neither one nor two, [`CameraError::Gone`] when one
+    /// of two is missing.
     pub fn find(&self) -> Result<SensorCameras, CameraError> {
         let all = topology::usb_cameras();
         match &self.choice {
             CameraChoice::ByTopology => {
                 topology::cameras_of(self.control_usb_path.as_deref(), &all)
-                    .map_err(|found| CameraError::NotFound { found })
             }
             CameraChoice::Nodes { left, right } => Ok(SensorCameras::Two {
                 left: camera_of(left, &all),

@@ -27,8 +27,14 @@ pub const CALIBRATION: &str = "/etc/stspp/camchain.yaml";
 /// What stands before the sensor.
 pub const SCENE: &str = "sphere";
 
-/// Devices by name: virtio port and bus id.
-pub const DEVICES: [(&str, &str, &str); 3] =
+/// The simulated sensor's option for one camera that sends both pictures.
+pub const SIDE_BY_SIDE: &str = "--side-by-side";
+
+/// A device's name, virtio port and bus id.
+pub type Device = (&'static str, &'static str, &'static str);
+
+/// All devices.
+pub const DEVICES: [Device; 3] =
     [("control", "usb-control", "1-1"), ("left", "usb-left", "1-2"), ("right", "usb-right", "1-3")];
 
 /// Sensor and machine.
@@ -54,11 +60,11 @@ impl Bench {
         Self { machine, server, folder, scale: SCENE_SCALE, slowness, in_process }
     }
 
-    /// Plugs all devices in, and gives the guest their calibration.
+    /// Plugs all of `devices` in, and gives the guest their calibration.
     ///
     /// # Errors
     /// What the guest said.
-    pub fn plug_all_in(&mut self) -> Result<(), String> {
+    pub fn plug_all_in(&mut self, devices: &[Device]) -> Result<(), String> {
         let file = self.folder.join("camchain.yaml");
         let text =
             std::fs::read_to_string(&file).map_err(|e| format!("{}: {e}", file.display()))?;
@@ -66,22 +72,25 @@ impl Bench {
         if reply.code != 0 {
             return Err(format!("{CALIBRATION}: {}", reply.text()));
         }
-        DEVICES.iter().try_for_each(|(device, ..)| self.plug_in(device))
+        devices.iter().try_for_each(|(device, ..)| self.plug_in(device))
     }
 
-    /// Unplugs the sensor and plugs in one with cameras of another size.
+    /// Unplugs the sensor and plugs in one whose cameras differ: in size, or as `options` say.
     ///
     /// # Errors
     /// When it does not start; what the guest said.
-    pub fn exchange(&mut self, scale: u32) -> Result<(), String> {
+    pub fn exchange(&mut self, scale: u32, options: &[&str]) -> Result<(), String> {
         for (device, ..) in DEVICES {
             self.server.command(&format!("unplug {device}"))?;
         }
+        // The guest's kernel takes a moment to let the old nodes go.
+        std::thread::sleep(Duration::from_millis(1500));
         self.server.end();
-        self.server = serve(&self.folder, scale, self.server.port)?;
+        self.server = serve(&self.folder, scale, self.server.port, options)?;
         self.scale = scale;
-        self.plug_all_in()?;
-        super::scenario::nodes(self)?;
+        let cameras = if options.contains(&SIDE_BY_SIDE) { 1 } else { 2 };
+        self.plug_all_in(&DEVICES[..1 + cameras])?;
+        super::scenario::wait_for_nodes(self, 2 * cameras)?;
         let deadline = Instant::now() + Duration::from_secs(30);
         while !self.finds_sensor()? {
             if Instant::now() > deadline {
@@ -300,11 +309,12 @@ impl Bench {
 ///
 /// # Errors
 /// When it does not start.
-pub fn serve(folder: &Path, scale: u32, port: u16) -> Result<Server, String> {
+pub fn serve(folder: &Path, scale: u32, port: u16, options: &[&str]) -> Result<Server, String> {
     let calibration = folder.join("camchain.yaml").display().to_string();
     let scale = scale.to_string();
     let arguments =
         ["--patient", "--scene", SCENE, "--scale", &scale, "--calibration", &calibration];
+    let arguments = [&arguments, options].concat();
     Server::start(&built("hil-sim"), &arguments, port, &folder.join("hil-sim.log"))
 }
 

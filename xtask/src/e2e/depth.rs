@@ -91,7 +91,7 @@ pub fn stream(bench: &mut Bench) -> Result<String, String> {
 /// Cameras of 1280x1024: pairs, and every frame of them accounted for.
 pub fn full_pairs(bench: &mut Bench) -> Result<String, String> {
     if bench.scale != 1 {
-        bench.exchange(1)?;
+        bench.exchange(1, &[])?;
     }
     scenario::set_timing(bench)?;
     let source = bench.source();

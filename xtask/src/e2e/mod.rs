@@ -8,12 +8,13 @@
 //! ```
 //!
 //! [`kernel`] fetches a Debian kernel, [`initrd`] packs the guest, [`machine`] boots it and talks to its
-//! first process, [`server`] is the simulated sensor, [`bench`](mod@bench) both together, [`scenario`]
-//! and [`depth`] what is tried, [`score`] how depth compares with the truth. Everything ends with this
+//! first process, [`server`] is the simulated sensor, [`bench`](mod@bench) both together, [`scenario`],
+//! [`depth`] and [`formats`] what is tried, [`score`] how depth compares with the truth. Everything ends with this
 //! process, however that ends.
 
 mod bench;
 mod depth;
+mod formats;
 mod initrd;
 mod kernel;
 mod machine;
@@ -21,6 +22,7 @@ mod scenario;
 mod score;
 mod server;
 
+use crate::stage::{self, Outcome};
 use crate::{debian, firmware, workspace};
 use bench::{Bench, DEVICES, SCENE_SCALE, built};
 use std::path::PathBuf;
@@ -54,11 +56,22 @@ pub fn run(only: Option<&str>) -> Result<String, String> {
     run_with(&kernel::prepare()?, only)
 }
 
+/// The same as a stage of the tests: left out where packages or a kernel cannot be had.
+pub fn stage() -> Outcome {
+    match debian::ensure(PACKAGES).and_then(|()| kernel::prepare()) {
+        Err(why) => Outcome::Skipped(why),
+        Ok(_) if !firmware::images_are_there() => {
+            Outcome::Skipped("there is no firmware to run: see the stage \"firmware\"".into())
+        }
+        Ok(kernel) => stage::check(run_with(&kernel, None)),
+    }
+}
+
 fn run_with(kernel: &kernel::Kernel, only: Option<&str>) -> Result<String, String> {
     let folder = workspace::root().join("target/e2e");
     let programs = build()?;
     let begun = Instant::now();
-    let server = bench::serve(&folder, SCENE_SCALE, 0)?;
+    let server = bench::serve(&folder, SCENE_SCALE, 0, &[])?;
     let in_guest = [("stspp", built("stspp")), ("transports", programs.transports)];
     let archive = initrd::build(kernel, &built("guest-init"), &in_guest)?;
     let image = folder.join("initrd.cpio");
@@ -72,21 +85,30 @@ fn run_with(kernel: &kernel::Kernel, only: Option<&str>) -> Result<String, Strin
     println!("guest is up after {boot_s:.1} s; limits {slowness:.1} times as long as usual");
     let time_limit = TIME_LIMIT.mul_f64(slowness);
     let mut bench = Bench::new(machine, server, &folder, slowness);
-    bench.plug_all_in()?;
+    bench.plug_all_in(&DEVICES)?;
     let mut outcomes: Vec<Tried> = Vec::new();
-    let named = if only.is_some() { scenario::NAMED } else { &[] };
-    for (name, scenario) in scenario::ALL.iter().chain(named) {
+    let mut repeated = 0;
+    for (name, scenario) in scenario::ALL {
         // What the kernel makes of the devices and the guest's pace come before all else.
         let is_first = outcomes.len() < scenario::FIRST;
         if only.is_some_and(|only| !only.split(',').any(|part| name.contains(part))) && !is_first {
             continue;
         }
         let start = Instant::now();
-        let result = if begun.elapsed() < time_limit {
-            scenario(&mut bench)
-        } else {
-            Err("not begun: the time is up".into())
-        };
+        let mut result = Err("not begun: the time is up".to_owned());
+        if begun.elapsed() < time_limit {
+            result = scenario(&mut bench);
+        }
+        // An emulated machine beside other work now and then stands still for seconds, which no limit
+        // foresees. What fails twice is wrong; that it failed once is told.
+        if let Err(first) = &result
+            && begun.elapsed() < time_limit
+        {
+            println!("{name:<28} once more after {:.1} s: {first}", start.elapsed().as_secs_f64());
+            repeated += 1;
+            bench.tidy();
+            result = scenario(&mut bench);
+        }
         let outcome = Tried { name, took: start.elapsed(), result };
         println!("{}", line(&outcome));
         if outcome.result.is_err() {
@@ -97,7 +119,11 @@ fn run_with(kernel: &kernel::Kernel, only: Option<&str>) -> Result<String, Strin
     let failed: Vec<&str> = outcomes.iter().filter(|o| o.result.is_err()).map(|o| o.name).collect();
     let seconds = begun.elapsed().as_secs();
     if failed.is_empty() {
-        Ok(format!("{} scenarios in the guest passed in {seconds} s", outcomes.len()))
+        let again = match repeated {
+            0 => String::new(),
+            _ => format!(", {repeated} of them at the second try"),
+        };
+        Ok(format!("{} scenarios in the guest passed in {seconds} s{again}", outcomes.len()))
     } else {
         Err(format!(
             "{} of {} scenarios failed: {}",

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 
 use super::bench::{Bench, TIMEOUT_S};
-use super::depth;
+use super::{depth, formats};
 
 /// A scenario's name, and what runs it: what was seen, or what was wrong.
 pub type Scenario = (&'static str, fn(&mut Bench) -> Result<String, String>);
@@ -37,41 +37,47 @@ pub const ALL: &[Scenario] = &[
     ("firmware hangs", hang),
     ("interlock opens", interlock),
     ("clock of the host steps", clock_step),
+    ("doctor names what is wrong", doctor_names),
     ("depth after all faults", depth::again),
+    ("pixel formats", formats::formats),
+    ("cameras side by side", formats::side_by_side),
+    // Pictures of 1280x1024 pass through some dozen wake-ups of an emulated processor each.
+    ("pairs at full size", depth::full_pairs),
+    ("depth at full size", depth::full_depth),
 ];
 
-/// Those that run only where they are named: pictures of 1280x1024 pass through some dozen wake-ups of an
-/// emulated processor each, which on a machine with other work to do takes seconds a picture.
-pub const NAMED: &[Scenario] =
-    &[("pairs at full size", depth::full_pairs), ("depth at full size", depth::full_depth)];
+/// What the kernel makes of all devices.
+fn nodes(bench: &mut Bench) -> Result<String, String> {
+    let names = wait_for_nodes(bench, 4)?;
+    let expected = ["stspp left camera", "stspp right camera"];
+    match expected.iter().find(|e| !names.iter().any(|n| n.starts_with(*e))) {
+        None => Ok("2 video and 2 metadata nodes by the stock uvcvideo".into()),
+        Some(_) => Err(format!("the kernel made {names:?}")),
+    }
+}
 
-/// Waits until the kernel has made its nodes of all devices.
+/// Waits until the kernel has made `count` video and metadata nodes; their names.
 ///
 /// # Errors
 /// What it made.
-pub fn nodes(bench: &mut Bench) -> Result<String, String> {
-    let expected = ["stspp left camera", "stspp right camera"];
-    let deadline = Instant::now() + Duration::from_secs(20);
+pub fn wait_for_nodes(bench: &mut Bench, count: usize) -> Result<Vec<String>, String> {
+    let deadline = Instant::now() + Duration::from_secs(20).mul_f64(bench.slowness);
     let mut names = Vec::new();
     while Instant::now() < deadline {
         names.clear();
-        for number in 0..4 {
+        for number in 0..8 {
             let path = format!("/sys/class/video4linux/video{number}/name");
             let reply = bench.machine.request(&["read", &path])?;
             if reply.code == 0 {
                 names.push(reply.text().trim().to_owned());
             }
         }
-        if names.len() == 4 {
-            break;
+        if names.len() == count {
+            return Ok(names);
         }
         std::thread::sleep(Duration::from_millis(200));
     }
-    let missing = expected.iter().find(|e| !names.iter().any(|n| n.starts_with(*e)));
-    match missing {
-        None if names.len() == 4 => Ok("2 video and 2 metadata nodes by the stock uvcvideo".into()),
-        _ => Err(format!("the kernel made {names:?}")),
-    }
+    Err(format!("the kernel made {names:?}"))
 }
 
 fn protocol_suite(bench: &mut Bench) -> Result<String, String> {
@@ -108,6 +114,58 @@ fn doctor(bench: &mut Bench) -> Result<String, String> {
         return Err(format!("{json}"));
     }
     Ok(format!("{} checks, none failed, {poor} could be better", checks.len()))
+}
+
+/// What is done to the sensor, what undoes it, and the check that must fail with these words.
+const AILMENTS: [(&str, &str, &str, &str); 4] = [
+    ("interlock open", "interlock closed", "state", "interlock"),
+    ("unplug right", "plug right", "cameras", "right camera is gone"),
+    ("unplug left", "plug left", "cameras", "left camera is gone"),
+    ("unplug control", "plug control", "on the bus", "no sensor"),
+];
+
+fn doctor_names(bench: &mut Bench) -> Result<String, String> {
+    for (harm, cure, check, words) in AILMENTS {
+        bench.server.command(harm)?;
+        let named = doctor_until(bench, |json| {
+            let checks = json["checks"].as_array().into_iter().flatten();
+            let mut bad = checks.filter(|c| c["verdict"] == "bad" && c["name"] == check);
+            bad.any(|c| {
+                let remedy = c["remedy"].as_str().unwrap_or_default();
+                c["found"].as_str().is_some_and(|f| f.contains(words)) && !remedy.is_empty()
+            })
+        });
+        bench.server.command(cure)?;
+        if let Some(device) = cure.strip_prefix("plug ") {
+            bench.plug_in(device)?;
+        }
+        named.map_err(|json| format!("{harm}: no word of {words:?} in {json}"))?;
+        bench.stspp(20, &["doctor", "--clear-faults", "--quiet", "--source", "usb:"])?;
+        doctor_until(bench, |json| json["bad"] == 0)
+            .map_err(|json| format!("after {cure}: {json}"))?;
+    }
+    set_timing(bench)?;
+    Ok("open interlock, either camera or the control interface unplugged: each named".into())
+}
+
+/// Asks `doctor` until it says what it should: the guest's kernel takes a moment to see a change.
+fn doctor_until(bench: &mut Bench, says: impl Fn(&Value) -> bool) -> Result<(), String> {
+    let source = bench.source();
+    let deadline = Instant::now() + Duration::from_secs(15).mul_f64(bench.slowness);
+    loop {
+        let reply = bench.stspp(30, &["doctor", "--json", "--source", &source])?;
+        let text = reply.text();
+        // An error may follow it.
+        let from = &text[text.find('{').unwrap_or(0)..];
+        let json = serde_json::Deserializer::from_str(from).into_iter().next().and_then(Result::ok);
+        if json.as_ref().is_some_and(&says) {
+            return Ok(());
+        }
+        if Instant::now() > deadline {
+            return Err(text);
+        }
+        std::thread::sleep(Duration::from_millis(300));
+    }
 }
 
 /// The longest period there is: the guest's emulated processor moves few pictures a second.
@@ -159,15 +217,25 @@ fn camera_controls(bench: &mut Bench) -> Result<String, String> {
 
 /// Streams `count` raw pairs; the counters at the end, after they were found to add up.
 fn stream(bench: &mut Bench, count: &str) -> Result<Value, String> {
+    Ok(stream_lines(bench, count)?.1)
+}
+
+/// Streams `count` raw pairs; what was told of each, and the counters at the end, after they were found
+/// to add up.
+///
+/// # Errors
+/// When the stream failed or frames are unaccounted for.
+pub fn stream_lines(bench: &mut Bench, count: &str) -> Result<(Vec<Value>, Value), String> {
     let source = bench.source();
     let arguments =
         ["stream", "--pairs", "--json", "--timeout", TIMEOUT_S, "--source", &source, "-n", count];
     let text = bench.stspp_ok(60, &arguments)?;
-    let last = text.lines().rfind(|line| line.contains("\"stats\"")).unwrap_or_default();
-    let json: Value = serde_json::from_str(last).map_err(|e| format!("{e}: {text}"))?;
-    let stats = json["stats"].clone();
+    let mut lines: Vec<Value> =
+        text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+    let last = lines.pop().filter(|last| last.get("stats").is_some());
+    let stats = last.ok_or_else(|| format!("no counters: {text}"))?["stats"].clone();
     add_up(&stats)?;
-    Ok(stats)
+    Ok((lines, stats))
 }
 
 /// A counter by its place.

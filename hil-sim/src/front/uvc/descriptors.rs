@@ -15,13 +15,19 @@ pub const PROCESSING_UNIT: u8 = 2;
 const OUTPUT_TERMINAL: u8 = 3;
 const BULK_PACKET: u16 = 512;
 
-/// How a pixel is stored.
+/// How a pixel is stored: as the kernel's formats of these names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PixelFormat {
     /// 8-bit grey.
     Grey,
+    /// 10 bits in 16, little-endian.
+    Y10,
+    /// 12 bits in 16, little-endian.
+    Y12,
     /// 16 bits little-endian, of which the camera's depth is used.
     Y16,
+    /// 8-bit luma, each followed by a byte of colour, which is none.
+    Yuyv,
 }
 
 impl PixelFormat {
@@ -29,14 +35,29 @@ impl PixelFormat {
     pub fn bytes(self) -> u32 {
         match self {
             Self::Grey => 1,
-            Self::Y16 => 2,
+            Self::Y10 | Self::Y12 | Self::Y16 | Self::Yuyv => 2,
+        }
+    }
+
+    /// Grey values of at most 16 bits as they are sent.
+    pub fn pack(self, values: &[u16]) -> Vec<u8> {
+        const NO_COLOUR: u8 = 128;
+        match self {
+            Self::Grey => values.iter().map(|&v| v as u8).collect(),
+            Self::Yuyv => values.iter().flat_map(|&v| [v as u8, NO_COLOUR]).collect(),
+            Self::Y10 | Self::Y12 | Self::Y16 => {
+                values.iter().flat_map(|v| v.to_le_bytes()).collect()
+            }
         }
     }
 
     fn guid(self) -> [u8; 16] {
         let code = match self {
             Self::Grey => *b"Y800",
+            Self::Y10 => *b"Y10 ",
+            Self::Y12 => *b"Y12 ",
             Self::Y16 => *b"Y16 ",
+            Self::Yuyv => *b"YUY2",
         };
         let mut guid = [0, 0, 0, 0, 0, 0, 0x10, 0, 0x80, 0, 0, 0xaa, 0, 0x38, 0x9b, 0x71];
         guid[..4].copy_from_slice(&code);

@@ -1,6 +1,8 @@
 //! Which video nodes belong to which camera, and which cameras to which sensor, by where they hang on
 //! the USB tree. All of it is read from sysfs.
 
+use crate::camera::CameraError;
+use crate::sync::Side;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -93,14 +95,15 @@ pub enum SensorCameras {
 /// the kernel, one on each bus: the control interface is at the one for slow devices, fast cameras at
 /// its twin. One camera that says "left" in its product string and one that says "right" are that,
 /// whatever else is there; otherwise, of two cameras, the lower port is left. A single camera is taken
-/// for one that delivers both pictures.
+/// for one that delivers both pictures, unless it says that it is the left or the right one.
 ///
 /// # Errors
-/// The number of cameras found, when that is neither one nor two.
+/// [`CameraError::NotFound`] when there are neither one nor two, [`CameraError::Gone`] when one of two
+/// is missing.
 pub fn cameras_of(
     control_usb_path: Option<&str>,
     cameras: &[UsbCamera],
-) -> Result<SensorCameras, usize> {
+) -> Result<SensorCameras, CameraError> {
     cameras_at(control_usb_path, cameras, |hub| twin_in(Path::new("/sys/bus/usb/devices"), hub))
 }
 
@@ -108,7 +111,7 @@ fn cameras_at(
     control_usb_path: Option<&str>,
     cameras: &[UsbCamera],
     twin: impl Fn(&str) -> Option<String>,
-) -> Result<SensorCameras, usize> {
+) -> Result<SensorCameras, CameraError> {
     let near = match control_usb_path {
         Some(control) => {
             let hub = hub_of(control);
@@ -127,13 +130,15 @@ fn cameras_at(
         return Ok(SensorCameras::Two { left: (**left).clone(), right: (**right).clone() });
     }
     match near.as_slice() {
+        [one] if says(one, "left") => Err(CameraError::Gone { side: Side::Right }),
+        [one] if says(one, "right") => Err(CameraError::Gone { side: Side::Left }),
         [one] => Ok(SensorCameras::SideBySide((*one).clone())),
         [a, b] => {
             let swapped = says(a, "right") || says(b, "left");
             let (left, right) = if swapped { (b, a) } else { (a, b) };
             Ok(SensorCameras::Two { left: (*left).clone(), right: (*right).clone() })
         }
-        other => Err(other.len()),
+        other => Err(CameraError::NotFound { found: other.len() }),
     }
 }
 
@@ -184,9 +189,11 @@ mod tests {
         ];
         let found = cameras_of(Some("1-2.1"), &all).unwrap();
         assert_eq!(found, SensorCameras::Two { left: all[0].clone(), right: all[1].clone() });
-        assert_eq!(cameras_of(Some("2-2.1"), &all), Ok(SensorCameras::SideBySide(all[3].clone())));
-        assert_eq!(cameras_of(Some("4-1"), &all), Err(0));
-        assert_eq!(cameras_of(None, &all), Err(4));
+        let alone = cameras_of(Some("2-2.1"), &all).unwrap();
+        assert_eq!(alone, SensorCameras::SideBySide(all[3].clone()));
+        let none = cameras_of(Some("4-1"), &all);
+        assert!(matches!(none, Err(CameraError::NotFound { found: 0 })));
+        assert!(matches!(cameras_of(None, &all), Err(CameraError::NotFound { found: 4 })));
     }
 
     #[test]
@@ -195,7 +202,8 @@ mod tests {
         let twin = |hub: &str| (hub == "1-2").then(|| "2-4".to_owned());
         let found = cameras_at(Some("1-2.3"), &all, twin).unwrap();
         assert_eq!(found, SensorCameras::Two { left: all[0].clone(), right: all[1].clone() });
-        assert_eq!(cameras_at(Some("1-2.3"), &all, |_| None), Err(0));
+        let apart = cameras_at(Some("1-2.3"), &all, |_| None);
+        assert!(matches!(apart, Err(CameraError::NotFound { found: 0 })));
     }
 
     #[test]
@@ -222,6 +230,14 @@ mod tests {
         let all = [camera("1-1", "Right IR"), camera("1-2", "Left IR")];
         let found = cameras_of(Some("1-3"), &all).unwrap();
         assert_eq!(found, SensorCameras::Two { left: all[1].clone(), right: all[0].clone() });
+    }
+
+    #[test]
+    fn one_of_two_is_not_both_side_by_side() {
+        for (product, missing) in [("IR left", Side::Right), ("IR right", Side::Left)] {
+            let found = cameras_of(Some("1-3"), &[camera("1-1", product)]);
+            assert!(matches!(found, Err(CameraError::Gone { side }) if side == missing));
+        }
     }
 
     #[test]

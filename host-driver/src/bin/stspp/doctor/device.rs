@@ -228,6 +228,7 @@ fn cameras(plan: &CameraPlan, checks: &mut Vec<Check>) {
                 CameraError::NotFound { found: 0 } => {
                     "check the cameras' cables and power; `modprobe uvcvideo`"
                 }
+                CameraError::Gone { .. } => "check that camera's cable and power",
                 _ => "name the nodes: `?left=/dev/video0&right=/dev/video2`",
             };
             checks.push(Check::bad("cameras", error.to_string(), remedy));
