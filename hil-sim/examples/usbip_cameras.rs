@@ -36,7 +36,12 @@ impl FrameSource for Ramp {
             .map(|x| ((x + due) % 256 * u64::from(settings.gain_percent) / 100).min(255) as u8)
             .collect();
         let (exposure_ticks, sof) = self.clock();
-        Some(Frame { pixels: row.repeat(usize::from(HEIGHT)), exposure_ticks, sof })
+        Some(Frame {
+            pixels: row.repeat(usize::from(HEIGHT)),
+            exposure_ticks,
+            sof,
+            is_damaged: false,
+        })
     }
 
     fn clock(&self) -> (u32, u16) {

@@ -28,7 +28,7 @@ impl FrameSource for Counting {
         *left = left.checked_sub(1)?;
         let first = settings.gain_percent as usize;
         let pixels = (0..usize::from(WIDTH) * usize::from(HEIGHT)).map(|i| (first + i) as u8);
-        Some(Frame { pixels: pixels.collect(), exposure_ticks: 48_000, sof: 5 })
+        Some(Frame { pixels: pixels.collect(), exposure_ticks: 48_000, sof: 5, is_damaged: false })
     }
 
     fn clock(&self) -> (u32, u16) {
@@ -176,7 +176,12 @@ impl FrameSource for Endless {
     fn poll(&mut self, _: Settings) -> Option<Frame> {
         self.number += 1;
         self.pixels[..4].copy_from_slice(&self.number.to_le_bytes());
-        Some(Frame { pixels: self.pixels.clone(), exposure_ticks: self.number, sof: 0 })
+        Some(Frame {
+            pixels: self.pixels.clone(),
+            exposure_ticks: self.number,
+            sof: 0,
+            is_damaged: false,
+        })
     }
 
     fn clock(&self) -> (u32, u16) {

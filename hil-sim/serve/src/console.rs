@@ -7,12 +7,13 @@ use stspp_hil_mcu::soc::peripheral::ResetCause;
 use stspp_hil_sim::device::Controller;
 use stspp_hil_sim::front::bench::Bench;
 use stspp_hil_sim::front::eyes::FrameFault;
-use stspp_hil_sim::front::plug::Cable;
+use stspp_hil_sim::front::plug::{Cable, Tampering};
 use stspp_hil_sim::rig::CAMERAS;
 use stspp_protocol::usb;
 
 const HELP: &str = "unplug control|left|right, plug control|left|right, \
-                    halt requests|replies|events, fault left|right lost|duplicated|lagging|short, interlock open|closed, \
+                    halt requests|replies|events, fault left|right lost|duplicated|lagging|short|corrupt, fault events|replies lost|corrupt, \
+                    interlock open|closed, \
                     hang, reset, status";
 
 /// Faults to come of one camera.
@@ -45,6 +46,7 @@ impl Console {
             ["unplug", device] => self.plug(device, false),
             ["plug", device] => self.plug(device, true),
             ["halt", endpoint] => self.halt(endpoint),
+            ["fault", endpoint @ ("events" | "replies"), fault] => self.tamper(endpoint, fault),
             ["fault", camera, fault] => self.fault(camera, fault),
             ["interlock", "open"] => self.with_controller(|c| c.set_interlock_closed(false)),
             ["interlock", "closed"] => self.with_controller(|c| c.set_interlock_closed(true)),
@@ -83,10 +85,23 @@ impl Console {
             "duplicated" => FrameFault::Duplicated,
             "lagging" => FrameFault::Lagging,
             "short" => FrameFault::Short,
+            "corrupt" => FrameFault::Corrupt,
             _ => return None,
         };
         // Cameras side by side are one: the left one.
         self.faults.get(at)?.lock().unwrap_or_else(PoisonError::into_inner).push(fault);
+        Some(())
+    }
+
+    fn tamper(&self, endpoint: &str, fault: &str) -> Option<()> {
+        let tampering = match fault {
+            "lost" => Tampering::Lost,
+            "corrupt" => Tampering::Corrupt,
+            _ => return None,
+        };
+        let endpoint =
+            if endpoint == "events" { usb::ENDPOINT_EVENTS } else { usb::ENDPOINT_REPLIES };
+        self.cables[0].tamper(endpoint, tampering);
         Some(())
     }
 

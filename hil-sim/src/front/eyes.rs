@@ -155,6 +155,8 @@ pub enum FrameFault {
     Lagging,
     /// Half of it is missing.
     Short,
+    /// Its data are damaged, and the camera says so.
+    Corrupt,
 }
 
 /// One of the sensor's cameras, or both as one that sends their pictures side by side.
@@ -222,7 +224,7 @@ impl Eye {
             _ => side_by_side(&pictures, self.bank.world.model().left.height),
         };
         let sof = self.bench.frame_number(open_ns);
-        Some(Frame { pixels, exposure_ticks: self.ticks(open_ns), sof })
+        Some(Frame { pixels, exposure_ticks: self.ticks(open_ns), sof, is_damaged: false })
     }
 }
 
@@ -258,6 +260,7 @@ impl FrameSource for Eye {
             Some(FrameFault::Duplicated) => self.again = Some(frame.clone()),
             Some(FrameFault::Lagging) => self.lags = true,
             Some(FrameFault::Short) => frame.pixels.truncate(frame.pixels.len() / 2),
+            Some(FrameFault::Corrupt) => frame.is_damaged = true,
             None => {}
         }
         if self.lags {

@@ -5,17 +5,29 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use super::usb::{Answer, Identity, Kind, Setup, UsbFunction};
 
+/// What happens to a transfer on its way to the host.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Tampering {
+    /// It never arrives.
+    Lost,
+    /// A bit of it is turned over, and the bus did not notice.
+    Corrupt,
+}
+
 /// The cable of a device: in at first.
 #[derive(Debug, Clone)]
 pub struct Cable {
     plugged: Arc<AtomicBool>,
     /// Addresses of halted endpoints.
     halted: Arc<Mutex<Vec<u8>>>,
+    /// What happens to the next transfers from these endpoints.
+    tampered: Arc<Mutex<Vec<(u8, Tampering)>>>,
 }
 
 impl Default for Cable {
     fn default() -> Self {
-        Self { plugged: Arc::new(AtomicBool::new(true)), halted: Arc::default() }
+        let plugged = Arc::new(AtomicBool::new(true));
+        Self { plugged, halted: Arc::default(), tampered: Arc::default() }
     }
 }
 
@@ -34,6 +46,17 @@ impl Cable {
     /// Halts an endpoint until the host clears it.
     pub fn halt(&self, endpoint: u8) {
         self.halted().push(endpoint);
+    }
+
+    /// Tampers with the next transfer from an endpoint.
+    pub fn tamper(&self, endpoint: u8, tampering: Tampering) {
+        self.tampered.lock().unwrap_or_else(PoisonError::into_inner).push((endpoint, tampering));
+    }
+
+    fn take_tampering(&self, endpoint: u8) -> Option<Tampering> {
+        let mut tampered = self.tampered.lock().unwrap_or_else(PoisonError::into_inner);
+        let at = tampered.iter().position(|(of, _)| *of == endpoint)?;
+        Some(tampered.remove(at).1)
     }
 
     fn halted(&self) -> MutexGuard<'_, Vec<u8>> {
@@ -85,7 +108,20 @@ impl<F: UsbFunction> UsbFunction for Plugged<F> {
         if self.cable.halted().contains(&(endpoint | 0x80)) {
             return Answer::Stall;
         }
-        self.function.transfer_in(endpoint, length)
+        let mut answer = self.function.transfer_in(endpoint, length);
+        if let Answer::Done(data) = &mut answer
+            && !data.is_empty()
+        {
+            match self.cable.take_tampering(endpoint | 0x80) {
+                Some(Tampering::Lost) => return Answer::Nak,
+                Some(Tampering::Corrupt) => {
+                    let middle = data.len() / 2;
+                    data[middle] ^= 0x10;
+                }
+                None => {}
+            }
+        }
+        answer
     }
 
     fn transfer_out(&mut self, endpoint: u8, data: &[u8]) -> Answer<usize> {

@@ -30,6 +30,9 @@ pub const ALL: &[Scenario] = &[
     ("duplicated frame", |bench| frame_fault(bench, "right", "duplicated")),
     ("camera a frame late", |bench| frame_fault(bench, "left", "lagging")),
     ("short picture", |bench| frame_fault(bench, "right", "short")),
+    ("corrupt picture", |bench| frame_fault(bench, "right", "corrupt")),
+    ("lost trigger event", |bench| event_fault(bench, "lost")),
+    ("corrupt trigger event", |bench| event_fault(bench, "corrupt")),
     ("halted endpoint", halt),
     ("camera unplugged, plugged", camera_unplugged),
     ("control unplugged, plugged", control_unplugged),
@@ -319,6 +322,22 @@ fn frame_fault(bench: &mut Bench, camera: &str, fault: &str) -> Result<String, S
     .map(|(name, path)| format!("{} {name}", number(&stats, path)))
     .collect();
     Ok(format!("40 pairs went on; counted: {}", counted.join(", ")))
+}
+
+/// One transfer of trigger events is lost or damaged: the events in it are missed and counted, and their
+/// frames labelled as nothing else.
+fn event_fault(bench: &mut Bench, fault: &str) -> Result<String, String> {
+    bench.start_stream("40", &[])?;
+    bench.wait_lit()?;
+    std::thread::sleep(Duration::from_millis(1500));
+    bench.server.command(&format!("fault events {fault}"))?;
+    let stats = bench.finish_stream()?;
+    add_up(&stats)?;
+    let [lost, rejected] = ["/events_lost", "/rejected/no_trigger"].map(|p| number(&stats, p));
+    if lost == 0 {
+        return Err(format!("no event was missed: {stats}"));
+    }
+    Ok(format!("40 pairs went on; {lost} events lost, {rejected} frames without trigger"))
 }
 
 fn halt(bench: &mut Bench) -> Result<String, String> {

@@ -23,6 +23,8 @@ pub struct Frame {
     pub exposure_ticks: u32,
     /// USB frame number (11 bits) at the start of exposure.
     pub sof: u16,
+    /// The camera says that its data are damaged.
+    pub is_damaged: bool,
 }
 
 /// Settings that the host has made.

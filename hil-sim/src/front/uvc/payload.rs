@@ -22,6 +22,7 @@ impl Payload {
         const END_OF_FRAME: u8 = 1 << 1;
         const HAS_PRESENTATION_TIME: u8 = 1 << 2;
         const HAS_SOURCE_CLOCK: u8 = 1 << 3;
+        const ERROR: u8 = 1 << 6;
         const END_OF_HEADER: u8 = 1 << 7;
         let mut header = [0; HEADER_LENGTH];
         header[0] = HEADER_LENGTH as u8;
@@ -29,6 +30,7 @@ impl Payload {
             | END_OF_FRAME
             | HAS_PRESENTATION_TIME
             | HAS_SOURCE_CLOCK
+            | if frame.is_damaged { ERROR } else { 0 }
             | END_OF_HEADER;
         header[2..6].copy_from_slice(&frame.exposure_ticks.to_le_bytes());
         header[6..10].copy_from_slice(&clock.0.to_le_bytes());
