@@ -32,6 +32,8 @@ const SCALE_MIN_M: f64 = 2e-6;
 const PAIRS_MIN: usize = 100;
 /// Most rounds.
 const ROUNDS: usize = 25;
+/// Size of what two views alone share, to tell whether they have settled, metres.
+const ALONE_SIZE_M: f64 = 0.2;
 /// Poses have settled when no view moves by more than this at the object's size, metres.
 const SETTLED_M: f64 = 1e-6;
 
@@ -81,15 +83,23 @@ pub fn alone(
         check_rank(&normal.matrix)?;
         let factor = normal.matrix.cholesky().ok_or(RegisterError::Degenerate { free: 1 })?;
         let twist = -factor.solve(&normal.right);
-        let about = Isometry3::translation(centre.x, centre.y, centre.z);
-        let moved = about * motion_of_twist(&twist) * about.inverse() * poses[link.source];
-        poses[link.source] = moved;
+        poses[link.source] = motion_about(&centre, &twist) * poses[link.source];
         centre = normal.middle_m;
-        let moved_m = twist.fixed_rows::<3>(3).norm() + 0.2 * twist.fixed_rows::<3>(0).norm();
-        if moved_m < SETTLED_M || round >= ROUNDS {
+        if moved_m(&twist, ALONE_SIZE_M) < SETTLED_M || round >= ROUNDS {
             return Ok((poses[link.target].inverse() * poses[link.source], normal));
         }
     }
+}
+
+/// The motion of a twist about `centre_m`.
+fn motion_about(centre_m: &Point3<f64>, twist: &Vector6<f64>) -> Isometry3<f64> {
+    let about = Isometry3::translation(centre_m.x, centre_m.y, centre_m.z);
+    about * motion_of_twist(twist) * about.inverse()
+}
+
+/// How far a twist moves points of an object of this size.
+fn moved_m(twist: &Vector6<f64>, size_m: f64) -> f64 {
+    twist.fixed_rows::<3>(3).norm() + size_m * twist.fixed_rows::<3>(0).norm()
 }
 
 /// A pair of points in the first view's frame.
@@ -138,15 +148,13 @@ pub fn solve(
         let right = right.rows(6, unknown).into_owned();
         let factor = matrix.cholesky().ok_or(RegisterError::Degenerate { free: 1 })?;
         let step = -factor.solve(&right);
-        let mut moved_m: f64 = 0.0;
+        let mut farthest_m: f64 = 0.0;
         for (view, pose) in first_from_view.iter_mut().enumerate().skip(1) {
             let twist: Vector6<f64> = step.fixed_rows::<6>(6 * (view - 1)).into_owned();
-            let turned_m = twist.fixed_rows::<3>(0).norm() * size_m;
-            moved_m = moved_m.max(turned_m + twist.fixed_rows::<3>(3).norm());
-            let about = Isometry3::translation(centre.x, centre.y, centre.z);
-            *pose = about * motion_of_twist(&twist) * about.inverse() * *pose;
+            farthest_m = farthest_m.max(moved_m(&twist, size_m));
+            *pose = motion_about(&centre, &twist) * *pose;
         }
-        if moved_m < SETTLED_M {
+        if farthest_m < SETTLED_M {
             break;
         }
     }

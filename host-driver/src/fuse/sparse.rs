@@ -183,10 +183,7 @@ fn without_rims(samples: &[Sample], rim_m: f64) -> Vec<Sample> {
         })
         .map(|(_, point)| *point)
         .collect();
-    let Some(rims) = PointTree::new(&rims).map(|tree| (tree, rims)) else {
-        return samples.to_vec();
-    };
-    let (rim_tree, rims) = rims;
+    let Some(rim_tree) = PointTree::new(&rims) else { return samples.to_vec() };
     let inner: Vec<Sample> = samples
         .par_iter()
         .zip(&points)
