@@ -85,7 +85,7 @@ pub fn budget(frame: &DepthFrame, truth: &CanvasTruth) -> Vec<Class> {
             if z.is_nan() {
                 one.missing = 1;
             } else if error.abs() <= OUTLIER_M {
-                let along = f64::from(error) * f64::from(truth.distance_m.row(y)[x] / true_z) * 1e3;
+                let along = truth.error_along_ray_m(x, y, z) * 1e3;
                 (one.good, one.squares_mm2) = (1, along * along);
             } else {
                 one.wrong = 1;

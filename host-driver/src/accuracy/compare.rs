@@ -63,12 +63,11 @@ pub fn compare(
     let errors = |frame: &DepthFrame| {
         let mut errors = Image::new(frame.depth_m.width(), frame.depth_m.height(), f32::NAN);
         for y in 0..errors.height() {
-            let of_truth = truth.depth_m.row(y).iter().zip(truth.distance_m.row(y));
-            let pixels = frame.depth_m.row(y).iter().zip(of_truth);
-            for (to, (z, (true_z, along))) in errors.row_mut(y).iter_mut().zip(pixels) {
-                let error = z - true_z;
-                let good = error.abs() <= OUTLIER_M;
-                *to = if good { error * along / true_z * 1e3 } else { f32::NAN };
+            let depths = frame.depth_m.row(y).iter().zip(truth.depth_m.row(y));
+            for (x, (to, (z, true_z))) in errors.row_mut(y).iter_mut().zip(depths).enumerate() {
+                if (z - true_z).abs() <= OUTLIER_M {
+                    *to = (truth.error_along_ray_m(x, y, *z) * 1e3) as f32;
+                }
             }
         }
         errors

@@ -161,8 +161,7 @@ pub fn central_plane_mm(frame: &DepthFrame, truth: &CanvasTruth) -> Result<(f64,
     let (mut sum_m, mut count) = (0.0, 0_u32);
     for y in y0..=y1.min(frame.depth_m.height().saturating_sub(1)) {
         for x in x0..=x1 {
-            let (z, true_z) = (frame.depth_m.row(y)[x], truth.depth_m.row(y)[x]);
-            let error = f64::from(z - true_z) * f64::from(truth.distance_m.row(y)[x] / true_z);
+            let error = truth.error_along_ray_m(x, y, frame.depth_m.row(y)[x]);
             if error.abs() <= f64::from(OUTLIER_M) {
                 (sum_m, count) = (sum_m + error, count + 1);
             }

@@ -87,4 +87,10 @@ impl CanvasTruth {
             visible_to_both: bytes(flat().map(|p| p.4).collect()),
         }
     }
+
+    /// How much farther away than the truth, along the pixel's ray, a point of depth `depth_m` is, metres.
+    pub fn error_along_ray_m(&self, x: usize, y: usize, depth_m: f32) -> f64 {
+        let true_m = self.depth_m.row(y)[x];
+        f64::from(depth_m - true_m) * f64::from(self.distance_m.row(y)[x] / true_m)
+    }
 }
