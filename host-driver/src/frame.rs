@@ -85,7 +85,7 @@ impl DepthFrame {
     /// the estimated speed is multiplied by half of the window's time. At the window's middle it hardly
     /// counts, so that this is what is measured, or fused, of a scene in motion. Without motion
     /// estimated, or without times, the frame is as it was.
-    pub fn at_window_middle(self) -> Self {
+    pub fn at_window_middle(mut self) -> Self {
         let Some((newest_s, rate)) = self.time_device_s.zip(self.depth_rate_m_per_s.as_ref())
         else {
             return self;
@@ -94,15 +94,15 @@ impl DepthFrame {
         let middle_s = times.sum::<f64>() / self.labels.len().max(1) as f64;
         let back_s = (newest_s - middle_s) as f32;
         let infinity_px = self.geometry.disparity_at_infinity_px() as f32;
-        let (mut depth_m, mut disparity_px) = (self.depth_m.clone(), self.disparity_px.clone());
-        let pixels = depth_m.as_mut_slice().iter_mut().zip(disparity_px.as_mut_slice());
+        let pixels = self.depth_m.as_mut_slice().iter_mut().zip(self.disparity_px.as_mut_slice());
         for ((z, d), rate) in pixels.zip(rate.as_slice()) {
             // The matcher's rate is one of the disparity; z is in proportion to 1 / parallax.
             let share = 1.0 + rate * back_s / *z;
             *d = infinity_px + (*d - infinity_px) * share;
             *z /= share;
         }
-        Self { depth_m, disparity_px, time_device_s: Some(middle_s), ..self }
+        self.time_device_s = Some(middle_s);
+        self
     }
 
     /// As [`Self::point_cloud`], in place of what `cloud` holds: a loop over frames that keeps its

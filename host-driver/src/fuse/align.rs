@@ -61,15 +61,10 @@ pub fn align(
             needed: params.overlap_min,
         });
     }
-    let failed = |source| FuseError::Pair {
-        source_name: "the views".into(),
-        target_name: "each other".into(),
-        source,
-    };
     refine::solve(sparse, &links, &mut poses, FINE_M, &mut |round| {
         progress(format!("all {} views at once, round {}", views.len(), round + 1));
     })
-    .map_err(failed)?;
+    .map_err(all_views)?;
     let reports: Vec<PairReport> = pairs.iter().map(|p| report(p, &poses)).collect();
     Ok(Aligned {
         loop_open_mm: loop_open_mm(views.len(), &pairs, sparse),
@@ -77,6 +72,11 @@ pub fn align(
         pairs: reports,
         first_from_view: poses,
     })
+}
+
+/// What no single pair of views is to blame for.
+fn all_views(source: RegisterError) -> FuseError {
+    FuseError::Pair { source_name: "the views".into(), target_name: "each other".into(), source }
 }
 
 /// Poses by ICP between all pairs that overlap and a pose graph: to the tenths of a millimetre.
@@ -121,11 +121,7 @@ fn near(
         RegisterError::Disconnected { view } => {
             FuseError::Apart { name: views[view].name.clone(), needed: params.overlap_min }
         }
-        source => FuseError::Pair {
-            source_name: "the views".into(),
-            target_name: "each other".into(),
-            source,
-        },
+        source => all_views(source),
     })?;
     Ok(solved.first_from_view)
 }
