@@ -19,6 +19,7 @@ pub mod motion;
 pub(crate) mod normalise;
 pub mod order;
 pub(crate) mod refit;
+mod rings;
 pub mod settle;
 pub(crate) mod solve;
 mod steps;

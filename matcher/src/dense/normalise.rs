@@ -7,84 +7,75 @@ use crate::{
     lanes::{Lanes, WIDEST, dispatch},
 };
 
-/// Windowed sums of a row (padded rows); those of squares in [`SQUARE_UNIT`].
-pub(crate) struct Windowed<'a> {
-    /// Valid pixels.
-    pub n: &'a [f32],
-    /// Sum of left grey values.
-    pub l: &'a [f32],
-    /// Sum of their squares.
-    pub ll: &'a [f32],
-    /// Sum of warped right grey values.
-    pub g: &'a [f32],
-    /// Sum of their squares.
-    pub gg: &'a [f32],
-}
-
 /// Variance below which a window counts as dark, per sample in (1/16 grey level)^2.
 const DARK: f32 = 16.0;
 
-/// Writes ratio = norm(L) / norm(g) and offset = mean L - ratio mean g per pixel, in padded rows;
-/// means are per frame sum, hence `frames`.
-pub(crate) fn gain_row(
-    level: Level,
-    windowed: &Windowed<'_>,
-    frames: usize,
-    len: usize,
-    ratio: &mut [f32],
-    offset: &mut [f32],
-) {
+/// What is known of the left images in a row's windows, for both passes (padded rows).
+pub(crate) struct LeftWindows<'a> {
+    /// One over the number of samples.
+    pub per: &'a [f32],
+    /// Mean grey value.
+    pub mean: &'a [f32],
+    /// Sum of squared differences from it; zero where dark.
+    pub variance: &'a [f32],
+}
+
+/// Brings windowed sums, of valid pixels, of left grey values and of their squares (in
+/// [`SQUARE_UNIT`]), to what [`LeftWindows`] has, in place. The sums are over `frames` frames.
+pub(crate) fn left_row(level: Level, [n, l, ll]: [&mut [f32]; 3], frames: usize, len: usize) {
     let padded = len + 2 * PAD;
     assert!(len.is_multiple_of(WIDEST));
-    for row in [windowed.n, windowed.l, windowed.ll, windowed.g, windowed.gg] {
-        assert!(row.len() >= padded);
-    }
-    assert!(ratio.len() >= padded && offset.len() >= padded);
+    assert!(n.len() >= padded && l.len() >= padded && ll.len() >= padded);
     dispatch!(
         level,
-        gain_lanes(
-            windowed: &Windowed<'_> = windowed,
+        left_lanes(
+            n: &mut [f32] = n,
+            l: &mut [f32] = l,
+            ll: &mut [f32] = ll,
             frames: f32 = frames as f32,
             len: usize = len,
-            ratio: &mut [f32] = ratio,
-            offset: &mut [f32] = offset,
         )
     );
 }
 
 #[inline(always)]
-fn gain_lanes<V: Lanes>(
-    windowed: &Windowed<'_>,
-    frames: f32,
-    len: usize,
-    ratio: &mut [f32],
-    offset: &mut [f32],
-) {
+fn left_lanes<V: Lanes>(n: &mut [f32], l: &mut [f32], ll: &mut [f32], frames: f32, len: usize) {
+    let (zero, one) = (V::splat(0.0), V::splat(1.0));
     for i in (PAD..PAD + len).step_by(V::COUNT) {
         // SAFETY: rows hold `len + 2 PAD` values.
         let load = |row: &[f32]| unsafe { V::load(row.as_ptr().add(i)) };
-        let unit = V::splat(SQUARE_UNIT);
-        let (n, l, ll) = (load(windowed.n), load(windowed.l), load(windowed.ll).mul(unit));
-        let (g, gg) = (load(windowed.g), load(windowed.gg).mul(unit));
-        let samples = n.mul(V::splat(frames));
-        let some = V::splat(0.5).lt(n);
-        let per = V::splat(1.0).div(V::select(some, samples, V::splat(1.0)));
-        let (mean_l, mean_g) = (l.mul(per), g.mul(per));
-        let var_l = mean_l.neg_mul_add(l, ll);
-        let var_g = mean_g.neg_mul_add(g, gg);
-        let floor = samples.mul(V::splat(DARK));
-        let lit = V::both(V::both(floor.lt(var_l), floor.lt(var_g)), some);
-        let quotient = var_l.div(V::select(lit, var_g, V::splat(1.0)));
-        let r = V::select(lit, quotient, V::splat(1.0)).sqrt();
+        let (count, sum) = (load(n), load(l));
+        let some = V::splat(0.5).lt(count);
+        let samples = count.mul(V::splat(frames));
+        let per = V::select(some, samples, one).reciprocal();
+        let mean = sum.mul(per);
+        let variance = mean.neg_mul_add(sum, load(ll).mul(V::splat(SQUARE_UNIT)));
+        let lit = V::both(some, samples.mul(V::splat(DARK)).lt(variance));
         // SAFETY: as above.
         unsafe {
-            r.store(ratio.as_mut_ptr().add(i));
-            r.neg_mul_add(mean_g, mean_l).store(offset.as_mut_ptr().add(i));
+            per.store(n.as_mut_ptr().add(i));
+            mean.store(l.as_mut_ptr().add(i));
+            V::select(lit, variance, zero).store(ll.as_mut_ptr().add(i));
         }
     }
 }
 
-/// The per-pixel terms of [`residual_row`], in padded rows.
+/// What a pass sums of the right images, in padded rows; squares and products of grey values in
+/// [`SQUARE_UNIT`].
+pub(crate) struct Right<'a> {
+    /// Windowed sum of warped grey values.
+    pub g: &'a [f32],
+    /// Of their squares.
+    pub gg: &'a [f32],
+    /// Sum of gradient times warped grey value, of the pixel alone as all below.
+    pub ig: &'a [f32],
+    /// Disparity of the warp, rounded as the warp did.
+    pub at: &'a [f32],
+    /// One where the warp is valid.
+    pub valid: &'a [f32],
+}
+
+/// What both passes have of a pixel in common, in padded rows.
 pub(crate) struct Terms<'a> {
     /// Sum of squared gradients, zero where the pixel does not take part.
     pub s: &'a [f32],
@@ -92,16 +83,6 @@ pub(crate) struct Terms<'a> {
     pub il: &'a [f32],
     /// Sum of gradients.
     pub i: &'a [f32],
-    /// Sum of gradient times warped right grey value.
-    pub ig: &'a [f32],
-    /// Gain.
-    pub ratio: &'a [f32],
-    /// Offset.
-    pub offset: &'a [f32],
-    /// Disparity of the warp, rounded as the warp did.
-    pub at: &'a [f32],
-    /// One where the warp is valid.
-    pub valid: &'a [f32],
     /// Disparity before rounding, for its slope; NaN where invalid.
     pub w: &'a [f32],
     /// Half the base over which the slope is taken.
@@ -112,130 +93,144 @@ pub(crate) struct Terms<'a> {
     pub origin: f32,
 }
 
+/// Windowed sums of products of grey values, and where the ZNCC made of them goes.
+pub(crate) struct Similarity<'a> {
+    pub lg: &'a [f32],
+    /// NaN where dark.
+    pub zncc: &'a mut [f32],
+}
+
 /// Writes q = S (w - origin) - (1 - dw/dx) b to a padded row, with
-/// b = sum I (L - mean L) - ratio sum I (g - mean g). Where the warp is not valid, b counts as zero.
-pub(crate) fn residual_row(level: Level, terms: &Terms<'_>, len: usize, q: &mut [f32]) {
+/// b = sum I (L - mean L) - ratio sum I (g - mean g), ratio = norm(L) / norm(g) of the pixel's window.
+/// Where the warp is not valid, b counts as zero.
+pub(crate) fn normalise_row(
+    level: Level,
+    left: &LeftWindows<'_>,
+    right: &Right<'_>,
+    terms: &Terms<'_>,
+    len: usize,
+    q: &mut [f32],
+    similarity: Option<Similarity<'_>>,
+) {
     let padded = len + 2 * PAD;
     assert!(len.is_multiple_of(WIDEST) && terms.base <= PAD && q.len() >= padded);
-    for row in [terms.s, terms.il, terms.i, terms.ig, terms.ratio, terms.offset] {
+    for row in [left.per, left.mean, left.variance, terms.s, terms.il, terms.i, terms.w] {
         assert!(row.len() >= padded);
     }
-    for row in [terms.at, terms.valid, terms.w] {
+    for row in [right.g, right.gg, right.ig, right.at, right.valid] {
         assert!(row.len() >= padded);
     }
+    assert!(similarity.as_ref().is_none_or(|s| s.lg.len() >= padded && s.zncc.len() >= padded));
     dispatch!(
         level,
-        residual_lanes(
+        normalise_lanes(
+            left: &LeftWindows<'_> = left,
+            right: &Right<'_> = right,
             terms: &Terms<'_> = terms,
             len: usize = len,
             q: &mut [f32] = q,
+            similarity: Option<Similarity<'_>> = similarity,
         )
     );
 }
 
 #[inline(always)]
-fn residual_lanes<V: Lanes>(terms: &Terms<'_>, len: usize, q: &mut [f32]) {
-    let zero = V::splat(0.0);
+fn normalise_lanes<V: Lanes>(
+    left: &LeftWindows<'_>,
+    right: &Right<'_>,
+    terms: &Terms<'_>,
+    len: usize,
+    q: &mut [f32],
+    similarity: Option<Similarity<'_>>,
+) {
+    match similarity {
+        None => {
+            let none = Similarity { lg: &[], zncc: &mut [] };
+            normalise_with::<V, false>(left, right, terms, len, q, none);
+        }
+        Some(similarity) => {
+            normalise_with::<V, true>(left, right, terms, len, q, similarity);
+        }
+    }
+}
+
+#[inline(always)]
+fn normalise_with<V: Lanes, const ZNCC: bool>(
+    left: &LeftWindows<'_>,
+    right: &Right<'_>,
+    terms: &Terms<'_>,
+    len: usize,
+    q: &mut [f32],
+    similarity: Similarity<'_>,
+) {
+    let (zero, one, unit) = (V::splat(0.0), V::splat(1.0), V::splat(SQUARE_UNIT));
     for i in (PAD..PAD + len).step_by(V::COUNT) {
         // SAFETY: rows hold `len + 2 PAD` values and the base is at most PAD.
         let load = |row: &[f32], at: usize| unsafe { V::load(row.as_ptr().add(at)) };
-        let (s, valid) = (load(terms.s, i), V::splat(0.5).lt(load(terms.valid, i)));
+        let (per, mean, variance) = (load(left.per, i), load(left.mean, i), load(left.variance, i));
+        let g = load(right.g, i);
+        let mean_g = g.mul(per);
+        let variance_g = mean_g.neg_mul_add(g, load(right.gg, i).mul(unit));
+        let lit = V::both(zero.lt(variance), V::splat(DARK).lt(variance_g.mul(per)));
+        // One over the product of both norms gives their ratio, and the similarity.
+        let scale = V::select(lit, variance.mul(variance_g), one).reciprocal_sqrt();
+        let ratio = V::select(lit, variance.mul(scale), one);
+        let offset = ratio.neg_mul_add(mean_g, mean);
+        if ZNCC {
+            let covariance = mean.neg_mul_add(g, load(similarity.lg, i).mul(unit));
+            let value = V::select(lit, covariance.mul(scale), V::splat(f32::NAN));
+            let value = V::select(one.lt(value), one, value);
+            // SAFETY: as above.
+            unsafe { value.store(similarity.zncc.as_mut_ptr().add(i)) };
+        }
+        let (s, valid) = (load(terms.s, i), V::splat(0.5).lt(load(right.valid, i)));
         let rise = load(terms.w, i + terms.base).sub(load(terms.w, i - terms.base));
         let gentle = rise.abs().lt(V::splat(terms.step));
         let slope = V::select(gentle, rise.mul(V::splat(0.5 / terms.base as f32)), zero);
-        let residual = load(terms.offset, i).neg_mul_add(
-            load(terms.i, i),
-            load(terms.ratio, i).neg_mul_add(load(terms.ig, i), load(terms.il, i)),
-        );
+        let residual = offset
+            .neg_mul_add(load(terms.i, i), ratio.neg_mul_add(load(right.ig, i), load(terms.il, i)));
         let b = V::select(valid, residual, zero);
-        let w = V::select(valid, load(terms.at, i), load(terms.w, i));
+        let w = V::select(valid, load(right.at, i), load(terms.w, i));
         let from = w.sub(V::splat(terms.origin)).mul(s);
-        let value = V::splat(1.0).sub(slope).neg_mul_add(b, from);
+        let value = one.sub(slope).neg_mul_add(b, from);
         let used = zero.lt(s);
         // SAFETY: as above.
         unsafe { V::select(used, value, zero).store(q.as_mut_ptr().add(i)) };
     }
 }
 
-/// ZNCC of a row from the windowed sums, with `lg` that of the products; NaN where dark.
-pub(crate) fn zncc_row(
+/// The static sums of pixels whose first warp is valid, zero elsewhere: `out` = `sums` times `valid`,
+/// padded rows.
+pub(crate) fn used_row(
     level: Level,
-    windowed: &Windowed<'_>,
-    lg: &[f32],
-    frames: usize,
+    valid: &[f32],
+    sums: [&[f32]; 3],
     len: usize,
-    zncc: &mut [f32],
+    out: [&mut [f32]; 3],
 ) {
     let padded = len + 2 * PAD;
-    assert!(len.is_multiple_of(WIDEST) && lg.len() >= padded && zncc.len() >= padded);
-    for row in [windowed.n, windowed.l, windowed.ll, windowed.g, windowed.gg] {
-        assert!(row.len() >= padded);
-    }
+    assert!(len.is_multiple_of(WIDEST) && valid.len() >= padded);
+    assert!(sums.iter().all(|r| r.len() >= padded) && out.iter().all(|r| r.len() >= padded));
     dispatch!(
         level,
-        zncc_lanes(
-            windowed: &Windowed<'_> = windowed,
-            lg: &[f32] = lg,
-            frames: f32 = frames as f32,
+        used_lanes(
+            valid: &[f32] = valid,
+            sums: [&[f32]; 3] = sums,
             len: usize = len,
-            zncc: &mut [f32] = zncc,
+            out: [&mut [f32]; 3] = out,
         )
     );
 }
 
 #[inline(always)]
-fn zncc_lanes<V: Lanes>(
-    windowed: &Windowed<'_>,
-    lg: &[f32],
-    frames: f32,
-    len: usize,
-    zncc: &mut [f32],
-) {
-    let one = V::splat(1.0);
-    for i in (PAD..PAD + len).step_by(V::COUNT) {
-        // SAFETY: rows hold `len + 2 PAD` values.
-        let load = |row: &[f32]| unsafe { V::load(row.as_ptr().add(i)) };
-        let unit = V::splat(SQUARE_UNIT);
-        let (n, l, ll) = (load(windowed.n), load(windowed.l), load(windowed.ll).mul(unit));
-        let (g, gg, lg) = (load(windowed.g), load(windowed.gg).mul(unit), load(lg).mul(unit));
-        let samples = n.mul(V::splat(frames));
-        let some = V::splat(0.5).lt(n);
-        let per = one.div(V::select(some, samples, one));
-        let covariance = l.mul(per).neg_mul_add(g, lg);
-        let var_l = l.mul(per).neg_mul_add(l, ll);
-        let var_g = g.mul(per).neg_mul_add(g, gg);
-        let floor = samples.mul(V::splat(DARK));
-        let lit = V::both(V::both(floor.lt(var_l), floor.lt(var_g)), some);
-        let norms = V::select(lit, var_l, one).sqrt().mul(V::select(lit, var_g, one).sqrt());
-        let value = V::select(lit, covariance.div(norms), V::splat(f32::NAN));
-        // SAFETY: as above.
-        unsafe { V::select(one.lt(value), one, value).store(zncc.as_mut_ptr().add(i)) };
-    }
-}
-
-/// out = a b, padded rows.
-pub(crate) fn product_row(level: Level, a: &[f32], b: &[f32], len: usize, out: &mut [f32]) {
-    let padded = len + 2 * PAD;
-    assert!(len.is_multiple_of(WIDEST));
-    assert!(a.len() >= padded && b.len() >= padded && out.len() >= padded);
-    dispatch!(
-        level,
-        product_lanes(
-            a: &[f32] = a,
-            b: &[f32] = b,
-            len: usize = len,
-            out: &mut [f32] = out,
-        )
-    );
-}
-
-#[inline(always)]
-fn product_lanes<V: Lanes>(a: &[f32], b: &[f32], len: usize, out: &mut [f32]) {
+fn used_lanes<V: Lanes>(valid: &[f32], sums: [&[f32]; 3], len: usize, out: [&mut [f32]; 3]) {
     for i in (PAD..PAD + len).step_by(V::COUNT) {
         // SAFETY: rows hold `len + 2 PAD` values.
         unsafe {
-            let v = V::load(a.as_ptr().add(i)).mul(V::load(b.as_ptr().add(i)));
-            v.store(out.as_mut_ptr().add(i));
+            let valid = V::load(valid.as_ptr().add(i));
+            for k in 0..3 {
+                V::load(sums[k].as_ptr().add(i)).mul(valid).store(out[k].as_mut_ptr().add(i));
+            }
         }
     }
 }

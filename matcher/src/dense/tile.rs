@@ -13,8 +13,11 @@ use super::{
     gradient::{Static, static_row},
     moments::{PAD, Powers, powers, slide_sum},
     motion::Motion,
-    normalise::{Terms, Windowed, gain_row, product_row, residual_row, restart_row, zncc_row},
+    normalise::{
+        LeftWindows, Right, Similarity, Terms, left_row, normalise_row, restart_row, used_row,
+    },
     refit::{FINE_RADIUS, Window, fine_row, refit_row},
+    rings::{Pass, Ring, around},
     solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
     warp::{Source, Warped, moving, warp_row},
 };
@@ -54,53 +57,6 @@ pub(crate) struct Output<'a> {
     pub brightness: Option<&'a mut [u8]>,
 }
 
-/// Padded rows by image row, the last `depth` of them kept.
-#[derive(Debug, Default)]
-struct Ring {
-    data: Aligned<f32>,
-    stride: usize,
-    depth: usize,
-}
-
-impl Ring {
-    fn resize(&mut self, stride: usize, depth: usize) {
-        if (self.stride, self.depth) != (stride, depth) {
-            self.data.resize(stride * depth, 0.0);
-            (self.stride, self.depth) = (stride, depth);
-        }
-        self.data.fill(0.0);
-    }
-
-    fn offset(&self, y: isize) -> usize {
-        y.rem_euclid(self.depth as isize) as usize * self.stride
-    }
-
-    fn row(&self, y: isize) -> &[f32] {
-        &self.data[self.offset(y)..][..self.stride]
-    }
-
-    fn row_mut(&mut self, y: isize) -> &mut [f32] {
-        let at = self.offset(y);
-        &mut self.data[at..][..self.stride]
-    }
-
-    /// The row without its pads.
-    fn inner_mut(&mut self, y: isize) -> &mut [f32] {
-        let stride = self.stride;
-        &mut self.row_mut(y)[PAD..stride - PAD]
-    }
-}
-
-/// Most rows of a window.
-const ROWS: usize = 17;
-
-/// Calls `work` with the 2 radius + 1 rows of `ring` around `y`.
-fn around<T>(ring: &Ring, y: isize, radius: usize, work: impl FnOnce(&[&[f32]]) -> T) -> T {
-    let rows: [&[f32]; ROWS] =
-        std::array::from_fn(|j| ring.row(y - radius as isize + j.min(2 * radius) as isize));
-    work(&rows[..2 * radius + 1])
-}
-
 /// Buffers of a tile, kept between tiles.
 #[derive(Debug, Default)]
 pub(crate) struct Tile {
@@ -119,75 +75,31 @@ pub(crate) struct Tile {
     powers: Powers,
     fine_powers: Powers,
     w0: Ring,
-    /// Static sums.
+    /// Static sums: those of squares only of the row in work.
     s: Ring,
     il: Ring,
     i: Ring,
     l: Ring,
     ll: Ring,
-    /// The static sums of grey values where the first warp is valid.
+    /// The static sums where the first warp is valid.
+    s_used: Ring,
     l_used: Ring,
     ll_used: Ring,
     first: Pass,
-    /// Gain and offset of the row in work.
-    ratio: Ring,
-    offset: Ring,
-    s_used: Ring,
     inverse: [Ring; FIRST + SECOND],
     w1: Ring,
     second: Pass,
-    /// Windowed sums n, l, ll, g, gg of the first pass.
-    sums: [Ring; 5],
-    /// Windowed sums g, gg, lg of the second pass.
-    sums_again: [Ring; 3],
+    /// What windows say of the left images.
+    left: [Ring; 3],
+    /// Windowed sums g, gg, lg of the row in work.
+    right: [Ring; 3],
     fit: [Ring; 2],
     zncc: Ring,
+    /// Brightness, which leaves with the fit.
+    light: Ring<u8>,
     /// The rate of the row in work.
     rate: Vec<f32>,
     moving: moving::Scratch,
-}
-
-/// A warp's terms, and q.
-#[derive(Debug, Default)]
-struct Pass {
-    at: Ring,
-    valid: Ring,
-    ig: Ring,
-    g: Ring,
-    gg: Ring,
-    lg: Ring,
-    q: Ring,
-}
-
-impl Pass {
-    fn resize(&mut self, stride: usize, window: usize) {
-        for ring in [&mut self.valid, &mut self.g, &mut self.gg, &mut self.lg] {
-            ring.resize(stride, window + 1);
-        }
-        for ring in [&mut self.at, &mut self.ig, &mut self.q] {
-            ring.resize(stride, window);
-        }
-    }
-
-    /// Where the warp of row `y` goes; the products of grey values are for the similarity, which
-    /// the first pass does not give.
-    fn warped(&mut self, y: isize, with_lg: bool) -> Warped<'_> {
-        Warped {
-            at: self.at.inner_mut(y),
-            valid: self.valid.inner_mut(y),
-            ig: self.ig.inner_mut(y),
-            g: self.g.inner_mut(y),
-            gg: self.gg.inner_mut(y),
-            lg: with_lg.then(|| self.lg.inner_mut(y)),
-        }
-    }
-
-    fn clear(&mut self, y: isize) {
-        for ring in [&mut self.at, &mut self.valid, &mut self.ig, &mut self.g, &mut self.gg] {
-            ring.row_mut(y).fill(0.0);
-        }
-        self.lg.row_mut(y).fill(0.0);
-    }
 }
 
 impl Tile {
@@ -208,28 +120,22 @@ impl Tile {
         for ring in [&mut self.w0, &mut self.il, &mut self.i, &mut self.w1] {
             ring.resize(stride, 3 * radius + 1);
         }
-        self.s_used.resize(stride, 4 * radius + 1);
-        for ring in [&mut self.s, &mut self.ll] {
-            ring.resize(stride, window);
+        self.s_used.resize(stride, 5 * radius + 1);
+        for ring in [&mut self.s, &mut self.l, &mut self.ll] {
+            ring.resize(stride, 1);
         }
-        self.l.resize(stride, 4 * radius + 1);
+        self.light.resize(len, 4 * radius + 1);
         // Window sums slide: the row that leaves is one behind the window.
         for ring in [&mut self.l_used, &mut self.ll_used] {
             ring.resize(stride, window + 1);
         }
-        for ring in &mut self.sums {
-            ring.resize(stride, window);
-        }
-        for ring in [&mut self.ratio, &mut self.offset] {
-            ring.resize(stride, 1);
-        }
-        for ring in &mut self.inverse {
+        for ring in self.left.iter_mut().chain(&mut self.inverse) {
             ring.resize(stride, window);
         }
         self.first.resize(stride, window);
         self.second.resize(stride, window);
         self.zncc.resize(stride, radius + 1);
-        for ring in self.sums_again.iter_mut().chain(&mut self.fit) {
+        for ring in self.right.iter_mut().chain(&mut self.fit) {
             ring.resize(stride, 1);
         }
     }
@@ -287,15 +193,8 @@ impl Tile {
                     (&mut *out.second, &self.fit[1], job.origin),
                 ];
                 if let Some(to) = &mut out.brightness {
-                    vectorised!(
-                        job.level,
-                        brightness_loop(
-                            light: &[f32] = &self.l.row(y4)[columns.clone()],
-                            // Sums over the frames of sixteenths.
-                            scale: f32 = 1.0 / (16.0 * job.frames as f32),
-                            to: &mut [u8] = &mut to[from + x_from..from + x_to],
-                        )
-                    );
+                    let light = &self.light.row(y4)[x_from - x0..x_to - x0];
+                    to[from + x_from..from + x_to].copy_from_slice(light);
                 }
                 let count = if job.fits == Fits::First { 2 } else { 3 };
                 for (to, ring, origin) in maps.into_iter().take(count) {
@@ -324,10 +223,8 @@ impl Tile {
         let w0 = self.w0.row_mut(y);
         w0.fill(f32::NAN);
         if !inside {
-            for ring in [&mut self.s, &mut self.il, &mut self.i, &mut self.l, &mut self.ll] {
-                ring.row_mut(y).fill(0.0);
-            }
-            for ring in [&mut self.l_used, &mut self.ll_used] {
+            let sums = [&mut self.il, &mut self.i, &mut self.s_used];
+            for ring in sums.into_iter().chain([&mut self.l_used, &mut self.ll_used]) {
                 ring.row_mut(y).fill(0.0);
             }
             self.first.clear(y);
@@ -359,9 +256,22 @@ impl Tile {
         let motion =
             job.motion.and_then(|m| m.of_row(y as usize, (x0, x1), self.len, &mut self.rate));
         warp(job.level, &source, motion, &mut self.moving, &mut self.first.warped(y, false));
-        let valid = self.first.valid.row(y);
-        product_row(job.level, self.l.row(y), valid, self.len, self.l_used.row_mut(y));
-        product_row(job.level, self.ll.row(y), valid, self.len, self.ll_used.row_mut(y));
+        used_row(
+            job.level,
+            self.first.valid.row(y),
+            [&self.s, &self.l, &self.ll].map(|ring| ring.row(y)),
+            self.len,
+            [&mut self.s_used, &mut self.l_used, &mut self.ll_used].map(|ring| ring.row_mut(y)),
+        );
+        vectorised!(
+            job.level,
+            brightness_loop(
+                light: &[f32] = &self.l.row(y)[PAD..PAD + self.len],
+                // Sums over the frames of sixteenths.
+                scale: f32 = 1.0 / (16.0 * job.frames as f32),
+                to: &mut [u8] = self.light.row_mut(y),
+            )
+        );
     }
 
     /// Adds row `y` to the column sums of the first or second pass, whose window is not yet whole.
@@ -379,48 +289,49 @@ impl Tile {
         }
     }
 
-    /// Gain and offset, and q of row `y`.
+    /// Windows around row `y` of the first pass, and q.
     fn normalise(&mut self, job: &Job<'_>, y: isize) {
         let (level, r, len) = (job.level, job.radius, self.len);
         let terms = [&self.first.valid, &self.l_used, &self.ll_used, &self.first.g, &self.first.gg];
         let ri = r as isize;
-        let columns = &mut self.columns[..5];
-        for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums).zip(columns) {
+        let sums = self.left.iter_mut().chain(&mut self.right);
+        for ((ring, sum), column) in terms.into_iter().zip(sums).zip(&mut self.columns) {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
             let scratch = (&mut column[..], &mut self.threes[..]);
             slide_sum(level, (enters, leaves), r, len, scratch, sum.row_mut(y));
         }
-        let [n, l, ll, g, gg] = &self.sums;
-        let windowed =
-            Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
-        gain_row(level, &windowed, job.frames, len, self.ratio.row_mut(y), self.offset.row_mut(y));
-        let used = self.s_used.row_mut(y);
-        product_row(level, self.s.row(y), self.first.valid.row(y), len, used);
+        left_row(level, self.left.each_mut().map(|ring| ring.row_mut(y)), job.frames, len);
         self.residual(job, y, false);
     }
 
-    /// q of row `y`, of the first or the second warp.
+    /// q of row `y`, of the first or the second warp; of the second the ZNCC too.
     fn residual(&mut self, job: &Job<'_>, y: isize, again: bool) {
         let (pass, w) = match again {
             false => (&mut self.first, &self.w0),
             true => (&mut self.second, &self.w1),
         };
+        let [per, mean, variance] = self.left.each_ref().map(|ring| ring.row(y));
+        let [g, gg, lg] = self.right.each_ref().map(|ring| ring.row(y));
+        let (ig, at, valid) = (pass.ig.row(y), pass.at.row(y), pass.valid.row(y));
         let terms = Terms {
             s: self.s_used.row(y),
             il: self.il.row(y),
             i: self.i.row(y),
-            ig: pass.ig.row(y),
-            ratio: self.ratio.row(y),
-            offset: self.offset.row(y),
-            at: pass.at.row(y),
-            valid: pass.valid.row(y),
             w: w.row(y),
             // A coarse start has whole pixels: its slope needs a wider base.
             base: if again { 2 } else { 4 },
             step: if again { 3.0 } else { 5.0 },
             origin: job.origin,
         };
-        residual_row(job.level, &terms, self.len, pass.q.row_mut(y));
+        normalise_row(
+            job.level,
+            &LeftWindows { per, mean, variance },
+            &Right { g, gg, ig, at, valid },
+            &terms,
+            self.len,
+            pass.q.row_mut(y),
+            again.then(|| Similarity { lg, zncc: self.zncc.row_mut(y) }),
+        );
     }
 
     /// M^-1 and the first fit of row `y`, then the second warp there.
@@ -456,24 +367,17 @@ impl Tile {
         }
     }
 
-    /// Gain and offset, q and ZNCC of row `y` from the second warp: the first
-    /// one, at whole pixels, leaves the gain uncertain by a part in a hundred.
+    /// Windows around row `y` of the second pass, q and ZNCC: the first warp, at whole pixels, leaves the
+    /// gain uncertain by a part in a hundred.
     fn normalise_again(&mut self, job: &Job<'_>, y: isize) {
-        let (level, r, len) = (job.level, job.radius, self.len);
         let terms = [&self.second.g, &self.second.gg, &self.second.lg];
-        let ri = r as isize;
+        let ri = job.radius as isize;
         let columns = &mut self.columns[5..];
-        for ((ring, sum), column) in terms.into_iter().zip(&mut self.sums_again).zip(columns) {
+        for ((ring, sum), column) in terms.into_iter().zip(&mut self.right).zip(columns) {
             let (enters, leaves) = (ring.row(y + ri), ring.row(y - ri - 1));
             let scratch = (&mut column[..], &mut self.threes[..]);
-            slide_sum(level, (enters, leaves), r, len, scratch, sum.row_mut(y));
+            slide_sum(job.level, (enters, leaves), job.radius, self.len, scratch, sum.row_mut(y));
         }
-        let ([n, l, ll, ..], [g, gg, lg]) = (&self.sums, &self.sums_again);
-        let windowed =
-            Windowed { n: n.row(y), l: l.row(y), ll: ll.row(y), g: g.row(y), gg: gg.row(y) };
-        let (ratio, offset) = (self.ratio.row_mut(y), self.offset.row_mut(y));
-        gain_row(level, &windowed, job.frames, len, ratio, offset);
-        zncc_row(level, &windowed, lg.row(y), job.frames, len, self.zncc.row_mut(y));
         self.residual(job, y, true);
     }
 
@@ -523,9 +427,7 @@ impl Tile {
             return;
         }
         let mut out = self.fit.each_mut().map(|h| h.row_mut(y));
-        for (flag, &step) in self.flagged.iter_mut().zip(step) {
-            *flag = f32::from(step);
-        }
+        vectorised!(level, flag_loop(step: &[u8] = step, flags: &mut [f32] = &mut self.flagged));
         self.flagged[step.len()..].fill(0.0);
         around(&self.s_used, y, r, |s| {
             around(&pass.q, y, r, |q| {
@@ -548,9 +450,18 @@ fn finish_loop(values: &[f32], valid: &[f32], origin: f32, to: &mut [f32]) {
 }
 
 #[inline(always)]
+fn flag_loop(step: &[u8], flags: &mut [f32]) {
+    for (flag, &step) in flags.iter_mut().zip(step) {
+        *flag = if step == 0 { 0.0 } else { 1.0 };
+    }
+}
+
+#[inline(always)]
 fn brightness_loop(light: &[f32], scale: f32, to: &mut [u8]) {
     for (to, light) in to.iter_mut().zip(light) {
-        *to = (light * scale + 0.5) as u8;
+        // Rounded by what the sum drops: a conversion that saturates is not vectorised.
+        let level = (light * scale).clamp(0.0, 255.0) + 8_388_608.0;
+        *to = level.to_bits() as u8;
     }
 }
 

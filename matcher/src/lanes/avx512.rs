@@ -45,17 +45,20 @@ impl Lanes for F32x16 {
         Self(unsafe { _mm512_mul_ps(self.0, other.0) })
     }
     #[inline(always)]
-    fn div(self, other: Self) -> Self {
-        // SAFETY: see the impl.
-        Self(unsafe { _mm512_div_ps(self.0, other.0) })
-    }
-    #[inline(always)]
     fn reciprocal(self) -> Self {
         // SAFETY: see the impl.
         // One Newton step on the processor's estimate.
         let estimate = Self(unsafe { _mm512_rcp14_ps(self.0) });
         let error = self.neg_mul_add(estimate, Self::splat(1.0));
         estimate.mul_add(error, estimate)
+    }
+    #[inline(always)]
+    fn reciprocal_sqrt(self) -> Self {
+        // SAFETY: see the impl.
+        // One Newton step on the processor's estimate.
+        let estimate = Self(unsafe { _mm512_rsqrt14_ps(self.0) });
+        let half = self.mul(Self::splat(0.5)).mul(estimate);
+        estimate.mul(half.neg_mul_add(estimate, Self::splat(1.5)))
     }
     #[inline(always)]
     fn mul_add(self, factor: Self, addend: Self) -> Self {
@@ -66,11 +69,6 @@ impl Lanes for F32x16 {
     fn neg_mul_add(self, factor: Self, addend: Self) -> Self {
         // SAFETY: see the impl.
         Self(unsafe { _mm512_fnmadd_ps(self.0, factor.0, addend.0) })
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        // SAFETY: see the impl.
-        Self(unsafe { _mm512_sqrt_ps(self.0) })
     }
     #[inline(always)]
     fn abs(self) -> Self {

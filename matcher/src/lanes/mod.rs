@@ -42,16 +42,15 @@ pub(crate) trait Lanes: Copy {
     fn sub(self, other: Self) -> Self;
     /// Product.
     fn mul(self, other: Self) -> Self;
-    /// Quotient.
-    fn div(self, other: Self) -> Self;
     /// 1 / self, to within two units in the last place.
     fn reciprocal(self) -> Self;
+    /// 1 / sqrt(self) of a positive number whose square is finite and not denormal, to within four units
+    /// in the last place.
+    fn reciprocal_sqrt(self) -> Self;
     /// self * factor + addend, fused where the level can.
     fn mul_add(self, factor: Self, addend: Self) -> Self;
     /// addend - self * factor, fused where the level can.
     fn neg_mul_add(self, factor: Self, addend: Self) -> Self;
-    /// Square root.
-    fn sqrt(self) -> Self;
     /// Magnitude.
     fn abs(self) -> Self;
     /// Whether self < other; false for NaN.

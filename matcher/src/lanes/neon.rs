@@ -45,13 +45,14 @@ impl Lanes for F32x4 {
         Self(unsafe { vmulq_f32(self.0, other.0) })
     }
     #[inline(always)]
-    fn div(self, other: Self) -> Self {
+    fn reciprocal(self) -> Self {
         // SAFETY: see the impl.
-        Self(unsafe { vdivq_f32(self.0, other.0) })
+        Self(unsafe { vdivq_f32(vdupq_n_f32(1.0), self.0) })
     }
     #[inline(always)]
-    fn reciprocal(self) -> Self {
-        Self::splat(1.0).div(self)
+    fn reciprocal_sqrt(self) -> Self {
+        // SAFETY: see the impl.
+        Self(unsafe { vdivq_f32(vdupq_n_f32(1.0), vsqrtq_f32(self.0)) })
     }
     #[inline(always)]
     fn mul_add(self, factor: Self, addend: Self) -> Self {
@@ -62,11 +63,6 @@ impl Lanes for F32x4 {
     fn neg_mul_add(self, factor: Self, addend: Self) -> Self {
         // SAFETY: see the impl.
         Self(unsafe { vfmsq_f32(addend.0, self.0, factor.0) })
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        // SAFETY: see the impl.
-        Self(unsafe { vsqrtq_f32(self.0) })
     }
     #[inline(always)]
     fn abs(self) -> Self {

@@ -37,12 +37,12 @@ impl Lanes for Plain {
         Self(self.0 * other.0)
     }
     #[inline(always)]
-    fn div(self, other: Self) -> Self {
-        Self(self.0 / other.0)
-    }
-    #[inline(always)]
     fn reciprocal(self) -> Self {
         Self(1.0 / self.0)
+    }
+    #[inline(always)]
+    fn reciprocal_sqrt(self) -> Self {
+        Self(1.0 / self.0.sqrt())
     }
     #[inline(always)]
     fn mul_add(self, factor: Self, addend: Self) -> Self {
@@ -51,10 +51,6 @@ impl Lanes for Plain {
     #[inline(always)]
     fn neg_mul_add(self, factor: Self, addend: Self) -> Self {
         Self(addend.0 - self.0 * factor.0)
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        Self(self.0.sqrt())
     }
     #[inline(always)]
     fn abs(self) -> Self {

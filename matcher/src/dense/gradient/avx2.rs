@@ -33,6 +33,8 @@ pub(super) unsafe fn blocks(
                 // SAFETY: the caller's promise covers 3 samples on both sides.
                 unsafe {
                     let p = rows[f].as_ptr().add(x0 + at);
+                    // The image's next row.
+                    _mm_prefetch::<_MM_HINT_T0>(p.wrapping_add(rows[f].len()).cast());
                     // Written out: closures over vectors are not always inlined.
                     grey[f] = _mm256_mulhrs_epi16(_mm256_loadu_si256(p.offset(0).cast()), quarter);
                     let near = _mm256_subs_epi16(

@@ -154,6 +154,13 @@ unsafe fn blocks_with<const LG: bool>(
                     let even = _mm512_srli_epi32::<16>(sums[0]);
                     _mm512_mask_blend_epi16(0xAAAA_AAAA, even, sums[1])
                 };
+                // The images' next row, a line of 32 samples for two blocks.
+                if block % 2 == 0 {
+                    for row in rows {
+                        let next = row.as_ptr().wrapping_add(row.len() + base as usize + 16);
+                        _mm_prefetch::<_MM_HINT_T0>(next.cast());
+                    }
+                }
                 let word = pair * source.stride + i;
                 // SAFETY: `word + 16` lies within the gradients.
                 let gradient =
