@@ -134,6 +134,7 @@ impl Fast {
             &mut self.step,
         );
         done("steps");
+        self.fit.set_watching(self.params.motion);
         self.fit.fit(stack, &self.start, &self.step, &mut self.maps);
         done("dense");
         if self.params.advanced.settle_steps {

@@ -29,7 +29,7 @@ pub(crate) mod warp;
 use rayon::prelude::*;
 
 use crate::{Image, Level, Sample, ShapeFunction, StereoStack, parallel::PerThread};
-use motion::{BLOCK, Motion};
+use motion::{BLOCK, Motion, along::Watch, sums::Blocks};
 use solve::Fits;
 pub use steps::mark_steps;
 use tile::{Job, Output, Tile};
@@ -54,6 +54,11 @@ pub struct DenseFit {
     /// Number of fits made.
     stamp: u64,
     zero: Image<Sample>,
+    /// Whether to look for motion along the way.
+    watches: bool,
+    /// What the last fit saw of it, if it did.
+    seen: Blocks,
+    saw: bool,
 }
 
 /// Maps of a dense fit on the left canvas; NaN is invalid.
@@ -89,7 +94,21 @@ impl DenseFit {
             tiles: PerThread::default(),
             stamp: 0,
             zero: Image::new(0, 0, 0),
+            watches: true,
+            seen: Blocks::default(),
+            saw: false,
         }
+    }
+
+    /// Whether the fit also makes the sums by which motion is found, without which
+    /// [`motion::MotionFit`] makes them by itself; it does until told otherwise.
+    pub fn set_watching(&mut self, watches: bool) {
+        self.watches = watches;
+    }
+
+    /// What the last fit saw of motion, if it was one of a whole stack and looked for it.
+    pub(crate) fn seen(&self) -> Option<&Blocks> {
+        self.saw.then_some(&self.seen)
     }
 
     /// Changes the order of the shape function.
@@ -163,14 +182,18 @@ impl DenseFit {
             surface_px: self.surface_px,
             origin: origin(start),
             motion: again.and_then(|(motion, _)| motion),
+            watch: Watch::of(stack).filter(|_| self.watches && again.is_none()),
         };
+        self.saw = job.watch.is_some();
+        self.seen.begin(width, height);
         let tiles = self.tiles.ready();
-        // Results do not depend on where bands end.
+        // Results do not depend on where bands end, as long as they hold whole blocks.
         let band_rows = match again {
-            None => height.div_ceil(TASKS * threads).max(BAND),
+            None => height.div_ceil(TASKS * threads).max(BAND).next_multiple_of(BLOCK),
             Some(_) => BAND,
         };
         let rows = width * band_rows;
+        let blocks = self.seen.columns * (band_rows / BLOCK);
         let DenseMaps { first_px, second_px, zncc, brightness } = out;
         first_px
             .as_mut_slice()
@@ -178,16 +201,20 @@ impl DenseFit {
             .zip(second_px.as_mut_slice().par_chunks_mut(rows))
             .zip(zncc.as_mut_slice().par_chunks_mut(rows))
             .zip(brightness.as_mut_slice().par_chunks_mut(rows))
+            .zip(self.seen.blocks.par_chunks_mut(blocks))
             .enumerate()
-            .for_each(|(band, (((first, second), zncc), brightness))| {
+            .for_each(|(band, ((((first, second), zncc), brightness), blocks))| {
                 // Fits made anew leave it as it is.
                 let brightness = again.is_none().then_some(brightness);
-                let mut out = Output { first, second, zncc, brightness };
+                let mut out = Output { first, second, zncc, brightness, blocks };
                 tiles.with(|tile| {
                     for (from, to) in columns(width, band, again.map(|(_, blocks)| blocks)) {
                         let strips = (to - from).div_ceil(STRIP);
                         for strip in 0..strips {
-                            let part = |k: usize| from + (to - from) * k / strips;
+                            let part = |k: usize| match k == strips {
+                                true => to,
+                                false => from + (to - from) * k / strips / BLOCK * BLOCK,
+                            };
                             let columns = (part(strip), part(strip + 1));
                             tile.run(&job, columns, band * band_rows, &mut out);
                         }

@@ -93,11 +93,25 @@ pub(crate) struct Terms<'a> {
     pub origin: f32,
 }
 
-/// Windowed sums of products of grey values, and where the ZNCC made of them goes.
-pub(crate) struct Similarity<'a> {
+/// What the second pass gives besides.
+pub(crate) struct Besides<'a> {
+    /// Windowed sums of products of grey values.
     pub lg: &'a [f32],
-    /// NaN where dark.
+    /// The ZNCC made of them; NaN where dark.
     pub zncc: &'a mut [f32],
+    /// Where motion is looked for.
+    pub timed: Option<TimedTerms<'a>>,
+}
+
+/// q of gradients that are weighted by time, from sums that hold one weighted gradient each.
+pub(crate) struct TimedTerms<'a> {
+    /// Sum of weighted gradient times gradient.
+    pub s: &'a [f32],
+    pub il: &'a [f32],
+    pub i: &'a [f32],
+    pub ig: &'a [f32],
+    /// Zero where the warp is not valid.
+    pub q: &'a mut [f32],
 }
 
 /// Writes q = S (w - origin) - (1 - dw/dx) b to a padded row, with
@@ -110,7 +124,7 @@ pub(crate) fn normalise_row(
     terms: &Terms<'_>,
     len: usize,
     q: &mut [f32],
-    similarity: Option<Similarity<'_>>,
+    besides: Option<Besides<'_>>,
 ) {
     let padded = len + 2 * PAD;
     assert!(len.is_multiple_of(WIDEST) && terms.base <= PAD && q.len() >= padded);
@@ -120,7 +134,10 @@ pub(crate) fn normalise_row(
     for row in [right.g, right.gg, right.ig, right.at, right.valid] {
         assert!(row.len() >= padded);
     }
-    assert!(similarity.as_ref().is_none_or(|s| s.lg.len() >= padded && s.zncc.len() >= padded));
+    assert!(besides.as_ref().is_none_or(|b| b.lg.len() >= padded && b.zncc.len() >= padded));
+    if let Some(t) = besides.as_ref().and_then(|b| b.timed.as_ref()) {
+        assert!([t.s, t.il, t.i, t.ig, &t.q[..]].iter().all(|row| row.len() >= padded));
+    }
     dispatch!(
         level,
         normalise_lanes(
@@ -129,7 +146,7 @@ pub(crate) fn normalise_row(
             terms: &Terms<'_> = terms,
             len: usize = len,
             q: &mut [f32] = q,
-            similarity: Option<Similarity<'_>> = similarity,
+            besides: Option<Besides<'_>> = besides,
         )
     );
 }
@@ -141,27 +158,30 @@ fn normalise_lanes<V: Lanes>(
     terms: &Terms<'_>,
     len: usize,
     q: &mut [f32],
-    similarity: Option<Similarity<'_>>,
+    besides: Option<Besides<'_>>,
 ) {
-    match similarity {
+    match besides {
         None => {
-            let none = Similarity { lg: &[], zncc: &mut [] };
-            normalise_with::<V, false>(left, right, terms, len, q, none);
+            let none = Besides { lg: &[], zncc: &mut [], timed: None };
+            normalise_with::<V, false, false>(left, right, terms, len, q, none);
         }
-        Some(similarity) => {
-            normalise_with::<V, true>(left, right, terms, len, q, similarity);
+        Some(besides) if besides.timed.is_none() => {
+            normalise_with::<V, true, false>(left, right, terms, len, q, besides);
+        }
+        Some(besides) => {
+            normalise_with::<V, true, true>(left, right, terms, len, q, besides);
         }
     }
 }
 
 #[inline(always)]
-fn normalise_with<V: Lanes, const ZNCC: bool>(
+fn normalise_with<V: Lanes, const ZNCC: bool, const TIMED: bool>(
     left: &LeftWindows<'_>,
     right: &Right<'_>,
     terms: &Terms<'_>,
     len: usize,
     q: &mut [f32],
-    similarity: Similarity<'_>,
+    mut besides: Besides<'_>,
 ) {
     let (zero, one, unit) = (V::splat(0.0), V::splat(1.0), V::splat(SQUARE_UNIT));
     for i in (PAD..PAD + len).step_by(V::COUNT) {
@@ -177,11 +197,11 @@ fn normalise_with<V: Lanes, const ZNCC: bool>(
         let ratio = V::select(lit, variance.mul(scale), one);
         let offset = ratio.neg_mul_add(mean_g, mean);
         if ZNCC {
-            let covariance = mean.neg_mul_add(g, load(similarity.lg, i).mul(unit));
+            let covariance = mean.neg_mul_add(g, load(besides.lg, i).mul(unit));
             let value = V::select(lit, covariance.mul(scale), V::splat(f32::NAN));
             let value = V::select(one.lt(value), one, value);
             // SAFETY: as above.
-            unsafe { value.store(similarity.zncc.as_mut_ptr().add(i)) };
+            unsafe { value.store(besides.zncc.as_mut_ptr().add(i)) };
         }
         let (s, valid) = (load(terms.s, i), V::splat(0.5).lt(load(right.valid, i)));
         let rise = load(terms.w, i + terms.base).sub(load(terms.w, i - terms.base));
@@ -196,6 +216,16 @@ fn normalise_with<V: Lanes, const ZNCC: bool>(
         let used = zero.lt(s);
         // SAFETY: as above.
         unsafe { V::select(used, value, zero).store(q.as_mut_ptr().add(i)) };
+        if TIMED && let Some(timed) = &mut besides.timed {
+            let residual = offset.neg_mul_add(
+                load(timed.i, i),
+                ratio.neg_mul_add(load(timed.ig, i), load(timed.il, i)),
+            );
+            let from = w.sub(V::splat(terms.origin)).mul(load(timed.s, i));
+            let value = V::select(valid, one.sub(slope).neg_mul_add(residual, from), zero);
+            // SAFETY: as above.
+            unsafe { value.store(timed.q.as_mut_ptr().add(i)) };
+        }
     }
 }
 

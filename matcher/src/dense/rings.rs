@@ -97,6 +97,7 @@ impl Pass {
             g: self.g.inner_mut(y),
             gg: self.gg.inner_mut(y),
             lg: with_lg.then(|| self.lg.inner_mut(y)),
+            timed: None,
         }
     }
 

@@ -12,9 +12,13 @@
 use super::{
     gradient::{Static, static_row},
     moments::{PAD, Powers, powers, slide_sum},
-    motion::Motion,
+    motion::{
+        BLOCK, Motion,
+        along::{Along, Found, Watch},
+        sums::Block,
+    },
     normalise::{
-        LeftWindows, Right, Similarity, Terms, left_row, normalise_row, restart_row, used_row,
+        Besides, LeftWindows, Right, Terms, left_row, normalise_row, restart_row, used_row,
     },
     refit::{FINE_RADIUS, Window, fine_row, refit_row},
     rings::{Pass, Ring, around},
@@ -46,6 +50,16 @@ pub(crate) struct Job<'a> {
     pub origin: f32,
     /// Each frame's own place, where the surface moves.
     pub motion: Option<&'a Motion>,
+    /// Where motion is looked for.
+    pub watch: Option<Watch>,
+}
+
+impl Job<'_> {
+    /// What to look for motion with in row `y`, if that row is looked at.
+    fn watch_at(&self, y: isize) -> Option<&Watch> {
+        let inside = (0..self.start.height() as isize).contains(&y);
+        self.watch.as_ref().filter(|_| inside && Watch::samples(y))
+    }
 }
 
 /// The rows a tile writes: full image rows, of which it fills the columns it was asked for.
@@ -55,6 +69,8 @@ pub(crate) struct Output<'a> {
     pub zncc: &'a mut [f32],
     /// Mean of the left images' grey values, where it is wanted.
     pub brightness: Option<&'a mut [u8]>,
+    /// Blocks of motion, of all columns.
+    pub blocks: &'a mut [Block],
 }
 
 /// Buffers of a tile, kept between tiles.
@@ -97,6 +113,7 @@ pub(crate) struct Tile {
     zncc: Ring,
     /// Brightness, which leaves with the fit.
     light: Ring<u8>,
+    along: Along,
     /// The rate of the row in work.
     rate: Vec<f32>,
     moving: moving::Scratch,
@@ -135,6 +152,7 @@ impl Tile {
         self.first.resize(stride, window);
         self.second.resize(stride, window);
         self.zncc.resize(stride, radius + 1);
+        self.along.resize(stride, self.words, window);
         for ring in self.right.iter_mut().chain(&mut self.fit) {
             ring.resize(stride, 1);
         }
@@ -184,6 +202,9 @@ impl Tile {
             }
             if y4 >= top {
                 self.fits(job, y4, x0, true, true);
+                if job.watch_at(y4).is_some() {
+                    self.look(job, y4, (x_from, x_to), x_from - x0 + PAD, y_from, out.blocks);
+                }
                 let from = (y4 - top) as usize * width;
                 let columns = x_from - x0 + PAD..x_to - x0 + PAD;
                 let valid = &self.second.valid.row(y4)[columns.clone()];
@@ -330,7 +351,11 @@ impl Tile {
             &terms,
             self.len,
             pass.q.row_mut(y),
-            again.then(|| Similarity { lg, zncc: self.zncc.row_mut(y) }),
+            again.then(|| Besides {
+                lg,
+                zncc: self.zncc.row_mut(y),
+                timed: job.watch_at(y).map(|_| self.along.terms(y)),
+            }),
         );
     }
 
@@ -363,7 +388,10 @@ impl Tile {
             let columns = (x0, (x0 + len).min(job.start.width()));
             let motion =
                 job.motion.and_then(|m| m.of_row(y as usize, columns, len, &mut self.rate));
-            warp(level, &source, motion, &mut self.moving, &mut self.second.warped(y, true));
+            let mut out = self.second.warped(y, true);
+            let words = (source.gradient, source.grey);
+            out.timed = job.watch_at(y).map(|watch| self.along.weigh(level, words, watch, y));
+            warp(level, &source, motion, &mut self.moving, &mut out);
         }
     }
 
@@ -379,6 +407,33 @@ impl Tile {
             slide_sum(job.level, (enters, leaves), job.radius, self.len, scratch, sum.row_mut(y));
         }
         self.residual(job, y, true);
+    }
+
+    /// Adds row `y`, whose fit is made, to the sums of motion; `at` is where its column `from` is kept,
+    /// and `blocks` begin at row `top`.
+    fn look(
+        &mut self,
+        job: &Job<'_>,
+        y: isize,
+        (from, to): (usize, usize),
+        at: usize,
+        top: usize,
+        blocks: &mut [Block],
+    ) {
+        // The first order's bias on curved surfaces would look like motion.
+        let order = usize::from(job.fits == Fits::Both);
+        let found = Found {
+            disparity: &self.fit[order].row(y)[at..],
+            origin: job.origin,
+            zncc: &self.zncc.row(y)[at..],
+            valid: &self.second.valid.row(y)[at..],
+            s: &self.s_used.row(y)[at..],
+            q: &self.second.q.row(y)[at..],
+        };
+        let row = (y as usize - top) / BLOCK * job.start.width().div_ceil(BLOCK);
+        let blocks = &mut blocks[row + from / BLOCK..row + to.div_ceil(BLOCK)];
+        let maps = (job.start, job.step);
+        self.along.add(job.level, maps, y as usize, (from, to), at, &found, blocks);
     }
 
     /// Fits of row `y` from the first or second pass, those at steps by the masked window.

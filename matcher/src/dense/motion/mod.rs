@@ -13,7 +13,8 @@
 //!
 //! summed over a wide window, since v is smooth. The steps:
 //!
-//! 1. `sums`: the sums above per block of 16 x 16 pixels, from every fourth row;
+//! 1. `along`: the sums above per block of 16 x 16 pixels, from every fourth row, made by the fit
+//!    itself; where they show motion `sums`, which does the same for any disparities and rates;
 //! 2. `rates`: a plane through the rates of the blocks around that move alike, its significance, and
 //!    from both the rate per pixel. Without significant motion nothing more is done, and the rate is
 //!    zero: a scene at rest pays neither noise nor much time;
@@ -21,9 +22,10 @@
 //!    itself that way, referred to the newest frame;
 //! 4. the sums once more; what they add to the rate moves the disparity by that much.
 
+pub(super) mod along;
 mod lag;
 mod rates;
-mod sums;
+pub(super) mod sums;
 mod weight;
 
 use super::{DenseFit, DenseMaps, warp::moving};
@@ -199,6 +201,14 @@ impl MotionFit {
         // The first order's bias on curved surfaces would look like motion.
         let both = fit.shape != ShapeFunction::First;
         let best = if both { &maps.second_px } else { &maps.first_px };
+        // What the fit saw along its way tells whether there is anything to look at more closely.
+        if let Some(seen) = fit.seen() {
+            self.rates.begin();
+            self.rates.add(seen, &times);
+            if !self.rates.any() {
+                return None;
+            }
+        }
         self.blocks.sum(&frame.of(best, &maps.zncc, None), None);
         self.rates.begin();
         self.rates.add(&self.blocks, &times);

@@ -20,13 +20,13 @@ use crate::{
 };
 
 /// Every how manyth row is summed: dots are taller than half of this.
-const ROWS_APART: usize = 4;
+pub(super) const ROWS_APART: usize = 4;
 /// Disparities of a block that spread more than this are of several surfaces.
 const SPREAD_PX: f32 = 6.0;
 /// Fewest pixels of a block that says anything.
-const PIXELS_MIN: f32 = 12.0;
+pub(super) const PIXELS_MIN: f32 = 12.0;
 /// Pixels of a lower ZNCC take no part.
-const ZNCC_MIN: f32 = 0.5;
+pub(super) const ZNCC_MIN: f32 = 0.5;
 /// Variance below which a block counts as dark, per sample in (1/16 grey level)^2.
 const DARK: f32 = 16.0;
 /// Slopes above this are steps.
@@ -87,8 +87,8 @@ struct Scratch {
 
 /// Bounds of the disparities of each block's main surface.
 #[derive(Debug, Default)]
-struct Surfaces {
-    bounds: Vec<(f32, f32)>,
+pub(super) struct Surfaces {
+    pub bounds: Vec<(f32, f32)>,
     all: Vec<f32>,
 }
 
@@ -97,12 +97,18 @@ struct Surfaces {
 const TERMS: usize = 14;
 
 impl Blocks {
+    /// Makes room for an image's blocks, which say nothing yet.
+    pub fn begin(&mut self, width: usize, height: usize) {
+        (self.columns, self.rows) = (width.div_ceil(BLOCK), height.div_ceil(BLOCK));
+        self.blocks.clear();
+        self.blocks.resize(self.columns * self.rows, Block::default());
+    }
+
     /// Sums the fit in `frame`, whose frames lie where `motion` says. Without motion, all lie at the
     /// same place.
     pub fn sum(&mut self, frame: &Frame<'_>, motion: Option<&Motion>) {
         let (width, height) = (frame.stack.width(), frame.stack.height());
-        (self.columns, self.rows) = (width.div_ceil(BLOCK), height.div_ceil(BLOCK));
-        self.blocks.resize(self.columns * self.rows, Block::default());
+        self.begin(width, height);
         let threads = rayon::current_num_threads().max(1);
         self.scratch.resize_with(threads.max(self.scratch.len()), Mutex::default);
         let scratch = &self.scratch;
@@ -144,7 +150,8 @@ impl Scratch {
         let end = (top + BLOCK).min(height);
         let sampled = (top..end).filter(|y| y % ROWS_APART == ROWS_APART / 2);
         let mut surfaces = std::mem::take(&mut self.surfaces);
-        bound(frame, sampled.clone(), blocks.len(), &mut surfaces);
+        let rows = sampled.clone().map(|y| frame.disparity_px.row(y));
+        surfaces.bound(frame.level, rows, blocks.len());
         let smear = motion.zip(frame.smeared);
         if let Some((_, radius)) = smear {
             self.lag.fill(frame, (top, end), radius);
@@ -171,9 +178,9 @@ impl Scratch {
             vectorised!(
                 frame.level,
                 total_loop(
-                    sums: &[Vec<f32>; TERMS + 2] = &self.sums,
+                    sums: &[Vec<f32>] = &self.sums,
                     from: usize = column * BLOCK,
-                    totals: &mut [f64; TERMS + 2] = &mut totals,
+                    totals: &mut [f64] = &mut totals,
                 )
             );
             *block = solve(totals, frames);
@@ -216,7 +223,8 @@ impl Scratch {
         let (gradient, grey) = (&self.weighted[..], &self.gradient[..]);
         let source =
             Source { right: &right[..even], x0: 0, w: &self.w, gradient, grey, stride: len };
-        let mut out = Warped { at: &mut self.at, valid: n, ig: igt, g, gg, lg: Some(ig) };
+        let mut out =
+            Warped { at: &mut self.at, valid: n, ig: igt, g, gg, lg: Some(ig), timed: None };
         let moving = motion.and_then(|m| m.of_row(y, (0, stack.width()), len, &mut self.rate));
         match moving {
             None => warp_row(frame.level, &source, &mut out),
@@ -259,42 +267,50 @@ fn bounds_loop(row: &[f32], bounds: &mut [(f32, f32)]) {
         for ((low, high), &d) in lows.iter_mut().zip(&mut highs).zip(pixels) {
             (*low, *high) = (least(*low, d), most(*high, d));
         }
-        *low = lows.into_iter().fold(*low, least);
-        *high = highs.into_iter().fold(*high, most);
+        // Halves against each other: a fold would wait for itself.
+        for half in [8, 4, 2, 1] {
+            for i in 0..half {
+                lows[i] = least(lows[i], lows[i + half]);
+                highs[i] = most(highs[i], highs[i + half]);
+            }
+        }
+        (*low, *high) = (least(*low, lows[0]), most(*high, highs[0]));
     }
 }
 
-/// Finds the bounds of each block's main surface from `rows`.
-fn bound(
-    frame: &Frame<'_>,
-    rows: impl Iterator<Item = usize> + Clone,
-    blocks: usize,
-    Surfaces { bounds, all }: &mut Surfaces,
-) {
-    bounds.clear();
-    bounds.resize(blocks, (f32::INFINITY, f32::NEG_INFINITY));
-    let rows = rows.map(|y| frame.disparity_px.row(y));
-    for row in rows.clone() {
-        vectorised!(
-            frame.level,
-            bounds_loop(row: &[f32] = row, bounds: &mut [(f32, f32)] = bounds)
-        );
-    }
-    for (column, (low, high)) in bounds.iter_mut().enumerate() {
-        if *high - *low <= SPREAD_PX {
-            continue;
-        }
-        all.clear();
+impl Surfaces {
+    /// Finds the bounds of `blocks` blocks' main surfaces from rows of disparities.
+    pub fn bound<'a>(
+        &mut self,
+        level: Level,
+        rows: impl Iterator<Item = &'a [f32]> + Clone,
+        blocks: usize,
+    ) {
+        let Self { bounds, all } = self;
+        bounds.clear();
+        bounds.resize(blocks, (f32::INFINITY, f32::NEG_INFINITY));
         for row in rows.clone() {
-            let end = ((column + 1) * BLOCK).min(row.len());
-            all.extend(row[column * BLOCK..end].iter().filter(|d| !d.is_nan()));
+            vectorised!(
+                level,
+                bounds_loop(row: &[f32] = row, bounds: &mut [(f32, f32)] = bounds)
+            );
         }
-        if all.is_empty() {
-            continue;
+        for (column, (low, high)) in bounds.iter_mut().enumerate() {
+            if *high - *low <= SPREAD_PX {
+                continue;
+            }
+            all.clear();
+            for row in rows.clone() {
+                let end = ((column + 1) * BLOCK).min(row.len());
+                all.extend(row[column * BLOCK..end].iter().filter(|d| !d.is_nan()));
+            }
+            if all.is_empty() {
+                continue;
+            }
+            let middle = all.len() / 2;
+            let (_, median, _) = all.select_nth_unstable_by(middle, f32::total_cmp);
+            (*low, *high) = (*median - SPREAD_PX, *median + SPREAD_PX);
         }
-        let middle = all.len() / 2;
-        let (_, median, _) = all.select_nth_unstable_by(middle, f32::total_cmp);
-        (*low, *high) = (*median - SPREAD_PX, *median + SPREAD_PX);
     }
 }
 
@@ -322,7 +338,7 @@ fn add_loop(terms: &[Vec<f32>; TERMS], w: &[f32], sums: &mut [Vec<f32>; TERMS + 
 
 /// Each term's sum over the pixels of a block from column `from`.
 #[inline(always)]
-fn total_loop(sums: &[Vec<f32>; TERMS + 2], from: usize, totals: &mut [f64; TERMS + 2]) {
+pub(super) fn total_loop(sums: &[Vec<f32>], from: usize, totals: &mut [f64]) {
     for (total, sum) in totals.iter_mut().zip(sums) {
         // Rows are a multiple of the block long. Eight sums side by side do not wait for each other.
         let Some(pixels) = sum[from..].first_chunk::<BLOCK>() else { continue };

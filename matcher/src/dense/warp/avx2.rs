@@ -42,7 +42,7 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
         // SAFETY: 32 bytes.
         let mask = unsafe { _mm256_loadu_si256(mask.as_ptr().cast()) };
         let zero = _mm256_setzero_si256();
-        let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
+        let (mut ig, mut g1, mut gg, mut lg, mut igt) = (zero, zero, zero, zero, zero);
         for (pair, rows) in source.right.chunks_exact(2).enumerate() {
             // The images' next row, a line of 32 samples for four blocks.
             if block % 4 == 0 {
@@ -93,6 +93,11 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
                 let grey = unsafe { _mm256_loadu_si256(source.grey.as_ptr().add(word).cast()) };
                 lg = _mm256_add_epi32(lg, _mm256_madd_epi16(g, grey));
             }
+            if let Some(timed) = &out.timed {
+                // SAFETY: as above, within the weighted gradients.
+                let t = unsafe { _mm256_loadu_si256(timed.gradient.as_ptr().add(word).cast()) };
+                igt = _mm256_add_epi32(igt, _mm256_madd_epi16(g, t));
+            }
             g1 = _mm256_add_epi32(g1, _mm256_madd_epi16(g, ones));
             gg = _mm256_add_epi32(gg, _mm256_madd_epi16(g, g));
         }
@@ -108,6 +113,9 @@ pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Wa
             _mm256_storeu_ps(out.gg.as_mut_ptr().add(i), square(gg));
             if let Some(out) = &mut out.lg {
                 _mm256_storeu_ps(out.as_mut_ptr().add(i), square(lg));
+            }
+            if let Some(timed) = &mut out.timed {
+                _mm256_storeu_ps(timed.ig.as_mut_ptr().add(i), float(igt));
             }
         }
     }

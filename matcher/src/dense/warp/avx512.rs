@@ -60,19 +60,20 @@ unsafe fn place(source: &Source<'_>, i: usize, width: i32) -> Place {
 pub(super) unsafe fn blocks(kernels: &Kernels, source: &Source<'_>, out: &mut Warped<'_>) -> usize {
     // SAFETY: the caller's promise.
     unsafe {
-        match out.lg {
-            None => blocks_with::<false>(kernels, source, out),
-            Some(_) => blocks_with::<true>(kernels, source, out),
+        match (&out.lg, &out.timed) {
+            (None, _) => blocks_with::<false, false>(kernels, source, out),
+            (_, None) => blocks_with::<true, false>(kernels, source, out),
+            _ => blocks_with::<true, true>(kernels, source, out),
         }
     }
 }
 
-/// [`blocks`], with or without the products of grey values.
+/// [`blocks`], with or without the products of grey values and those with weighted gradients.
 ///
 /// # Safety
 /// As there.
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512vnni")]
-unsafe fn blocks_with<const LG: bool>(
+unsafe fn blocks_with<const LG: bool, const TIMED: bool>(
     kernels: &Kernels,
     source: &Source<'_>,
     out: &mut Warped<'_>,
@@ -112,7 +113,7 @@ unsafe fn blocks_with<const LG: bool>(
         for (to, table) in taps.iter_mut().zip(tables) {
             *to = _mm512_permutexvar_epi32(phase, table);
         }
-        let (mut ig, mut g1, mut gg, mut lg) = (zero, zero, zero, zero);
+        let (mut ig, mut g1, mut gg, mut lg, mut igt) = (zero, zero, zero, zero, zero);
         // At whole pixels, where a coarse search starts, nothing is interpolated.
         let whole = _mm512_mask_test_epi32_mask(valid, phase, phase) == 0;
         let mut left = valid;
@@ -130,7 +131,8 @@ unsafe fn blocks_with<const LG: bool>(
             }
             // The sample itself, of the even and of the odd frame.
             let itself = _mm512_add_epi16(both, _mm512_set1_epi32(3 | (32 + 3) << 16));
-            let (mut ig_now, mut g1_now, mut gg_now, mut lg_now) = (zero, zero, zero, zero);
+            let (mut ig_now, mut g1_now, mut gg_now) = (zero, zero, zero);
+            let (mut lg_now, mut igt_now) = (zero, zero);
             for (pair, rows) in source.right.chunks_exact(2).enumerate() {
                 // SAFETY: 0 <= base <= width - 32.
                 let windows = unsafe {
@@ -171,6 +173,11 @@ unsafe fn blocks_with<const LG: bool>(
                     let grey = unsafe { _mm512_loadu_si512(source.grey.as_ptr().add(word).cast()) };
                     lg_now = _mm512_dpwssd_epi32(lg_now, g, grey);
                 }
+                if TIMED && let Some(timed) = &out.timed {
+                    // SAFETY: as above, within the weighted gradients.
+                    let t = unsafe { _mm512_loadu_si512(timed.gradient.as_ptr().add(word).cast()) };
+                    igt_now = _mm512_dpwssd_epi32(igt_now, g, t);
+                }
                 g1_now = _mm512_dpwssd_epi32(g1_now, g, ones);
                 gg_now = _mm512_dpwssd_epi32(gg_now, g, g);
             }
@@ -178,6 +185,7 @@ unsafe fn blocks_with<const LG: bool>(
             g1 = _mm512_mask_mov_epi32(g1, now, g1_now);
             gg = _mm512_mask_mov_epi32(gg, now, gg_now);
             lg = _mm512_mask_mov_epi32(lg, now, lg_now);
+            igt = _mm512_mask_mov_epi32(igt, now, igt_now);
             if left != 0 {
                 base = _mm512_mask_reduce_min_epi32(left, first);
             }
@@ -193,6 +201,9 @@ unsafe fn blocks_with<const LG: bool>(
             _mm512_storeu_ps(out.gg.as_mut_ptr().add(i), square(gg));
             if let Some(out) = &mut out.lg {
                 _mm512_storeu_ps(out.as_mut_ptr().add(i), square(lg));
+            }
+            if let Some(timed) = &mut out.timed {
+                _mm512_storeu_ps(timed.ig.as_mut_ptr().add(i), _mm512_cvtepi32_ps(igt));
             }
         }
     }

@@ -46,6 +46,16 @@ pub(crate) struct Warped<'a> {
     pub gg: &'a mut [f32],
     /// Sum over time of left times right grey value, in the same unit, where it is wanted.
     pub lg: Option<&'a mut [f32]>,
+    /// Where they are wanted, and `lg` is: products with gradients that are weighted by time.
+    pub timed: Option<Timed<'a>>,
+}
+
+/// Sums for motion.
+pub(crate) struct Timed<'a> {
+    /// Gradient pairs of the left stack times their frame's time, laid out as [`Source::gradient`].
+    pub gradient: &'a [i32],
+    /// Sum over time of these times the right grey value.
+    pub ig: &'a mut [f32],
 }
 
 /// Warps one row. Grey values are in 1/16 of an 8-bit grey level.
@@ -58,6 +68,9 @@ pub(crate) fn warp_row(level: Level, source: &Source<'_>, out: &mut Warped<'_>) 
     assert!(len <= source.stride && source.gradient.len() >= words && source.grey.len() >= words);
     for map in [&out.at, &out.valid, &out.ig, &out.g, &out.gg].into_iter().chain(&out.lg) {
         assert!(map.len() >= len);
+    }
+    if let Some(timed) = &out.timed {
+        assert!(timed.ig.len() >= len && timed.gradient.len() >= words && out.lg.is_some());
     }
     let kernels = Kernels::get();
     let done = match level {
@@ -92,7 +105,7 @@ mod tests {
     use super::*;
     use crate::synthetic::Random;
 
-    fn run(level: Level, right: &[Vec<Sample>], x0: usize, w: &[f32]) -> [Vec<f32>; 6] {
+    fn run(level: Level, right: &[Vec<Sample>], x0: usize, w: &[f32]) -> [Vec<f32>; 7] {
         let rows: Vec<&[Sample]> = right.iter().map(|r| &r[..]).collect();
         let mut random = Random::new(8);
         let words = rows.len() / 2 * w.len();
@@ -102,15 +115,21 @@ mod tests {
         };
         let gradient: Vec<i32> = (0..words).map(|_| pair(&mut random)).collect();
         let grey: Vec<i32> = (0..words).map(|_| pair(&mut random)).collect();
-        let mut maps: [Vec<f32>; 6] = std::array::from_fn(|_| vec![7.0; w.len()]);
-        let [at, valid, ig, g, gg, lg] = &mut maps;
+        let weighted: Vec<i32> = (0..words).map(|_| pair(&mut random)).collect();
+        let mut maps: [Vec<f32>; 7] = std::array::from_fn(|_| vec![7.0; w.len()]);
+        let [at, valid, ig, g, gg, lg, igt] = &mut maps;
         let source =
             Source { right: &rows, x0, w, gradient: &gradient, grey: &grey, stride: w.len() };
-        warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg: Some(lg) });
-        let mut without: [Vec<f32>; 5] = std::array::from_fn(|_| vec![7.0; w.len()]);
-        let [at, valid, ig, g, gg] = &mut without;
-        warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg: None });
-        assert!(without.iter().zip(&maps).all(|(a, b)| a == b), "{level}");
+        let timed = Some(Timed { gradient: &weighted, ig: igt });
+        warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg: Some(lg), timed });
+        for with_lg in [false, true] {
+            let mut without: [Vec<f32>; 6] = std::array::from_fn(|_| vec![7.0; w.len()]);
+            let [at, valid, ig, g, gg, lg] = &mut without;
+            let lg = with_lg.then_some(&mut lg[..]);
+            warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg, timed: None });
+            let count = if with_lg { 6 } else { 5 };
+            assert_eq!(without[..count], maps[..count], "{level}");
+        }
         maps
     }
 

@@ -17,7 +17,7 @@ pub(super) fn pixels(
 ) {
     let width = source.right[0].len();
     for i in range {
-        let (mut ig, mut g1, mut gg, mut lg) = (0i32, 0i32, 0i32, 0i32);
+        let (mut ig, mut g1, mut gg, mut lg, mut igt) = (0i32, 0i32, 0i32, 0i32, 0i32);
         let place = position(source.x0 + i, source.w[i], width);
         if let Some((_, first, phase)) = place {
             let taps = &kernels.taps[phase];
@@ -33,6 +33,9 @@ pub(super) fn pixels(
                     let of =
                         |word: i32| if half == 0 { i32::from(word as i16) } else { word >> 16 };
                     ig = ig.wrapping_add(of(source.gradient[word]) * g);
+                    if let Some(timed) = &out.timed {
+                        igt = igt.wrapping_add(of(timed.gradient[word]) * g);
+                    }
                     lg = lg.wrapping_add(of(source.grey[word]) * g);
                     g1 = g1.wrapping_add(g);
                     gg = gg.wrapping_add(g * g);
@@ -46,6 +49,9 @@ pub(super) fn pixels(
         out.gg[i] = square(gg);
         if let Some(out) = &mut out.lg {
             out[i] = square(lg);
+        }
+        if let Some(timed) = &mut out.timed {
+            timed.ig[i] = igt as f32;
         }
     }
 }

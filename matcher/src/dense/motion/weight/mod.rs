@@ -16,7 +16,7 @@ use crate::Level;
 const BLOCK: usize = 16;
 
 /// Where a row's results go.
-pub(super) struct Weighted<'a> {
+pub(crate) struct Weighted<'a> {
     /// Weighted gradient pairs, laid out as the gradients are.
     pub gradient: &'a mut [i32],
     /// Sum over time of weighted gradient times grey value.
@@ -30,7 +30,7 @@ pub(super) struct Weighted<'a> {
 }
 
 /// Times as the kernels take them: a pair of frames in a word.
-pub(super) fn words(times: &[f32; 16]) -> [i32; 8] {
+pub(crate) fn words(times: &[f32; 16]) -> [i32; 8] {
     let fixed = |t: f32| (t * 32_767.0).round_ties_even() as i16;
     std::array::from_fn(|k| {
         i32::from(fixed(times[2 * k]) as u16) | i32::from(fixed(times[2 * k + 1])) << 16
@@ -38,7 +38,7 @@ pub(super) fn words(times: &[f32; 16]) -> [i32; 8] {
 }
 
 /// Weighs the gradients of a row: as many words a pair of frames as each sum has pixels.
-pub(super) fn weigh(
+pub(crate) fn weigh(
     level: Level,
     gradient: &[i32],
     grey: &[i32],

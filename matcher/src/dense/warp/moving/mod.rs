@@ -258,7 +258,7 @@ mod tests {
         let (gradient, grey) = (&input.gradient[..], &input.grey[..]);
         let source = Source { right: &rows, x0, w, gradient, grey, stride: len };
         let moving = Moving { rate: &input.rate, offsets: &input.offsets };
-        let mut out = Warped { at, valid, ig, g, gg, lg: Some(lg) };
+        let mut out = Warped { at, valid, ig, g, gg, lg: Some(lg), timed: None };
         warp_moving_row(level, &source, &moving, &mut Scratch::default(), &mut out);
         maps
     }
@@ -296,7 +296,7 @@ mod tests {
         super::super::warp_row(
             Level::best(),
             &source,
-            &mut Warped { at, valid, ig, g, gg, lg: Some(lg) },
+            &mut Warped { at, valid, ig, g, gg, lg: Some(lg), timed: None },
         );
         assert_eq!(moving[1..], maps[1..]);
         for (a, b) in moving[0].iter().zip(&maps[0]) {
