@@ -50,6 +50,7 @@ pub struct Coarse {
     range: DisparityRange,
     left: Descriptors,
     right: Descriptors,
+    scratch: descriptor::Scratch,
     search: Search,
     raw: CoarseMap,
     rows: PerThread<clean::Rows>,
@@ -63,6 +64,7 @@ impl Coarse {
             range,
             left: Descriptors::default(),
             right: Descriptors::default(),
+            scratch: descriptor::Scratch::default(),
             search: Search::default(),
             raw: CoarseMap::new(0, 0),
             rows: PerThread::default(),
@@ -71,8 +73,8 @@ impl Coarse {
 
     /// Descriptors of both sides, the first stage of [`Coarse::search`].
     pub fn describe(&mut self, stack: &StereoStack<'_>) {
-        self.left.describe(self.level, stack.left);
-        self.right.describe(self.level, stack.right);
+        self.left.describe(self.level, stack.left, &mut self.scratch);
+        self.right.describe(self.level, stack.right, &mut self.scratch);
     }
 
     /// Fills `map` from the descriptors of the last [`Coarse::describe`], which must have been given

@@ -1,20 +1,15 @@
 //! Plain Rust.
 
-use super::{BLOCK, Rows};
+use super::{Rows, codes::BLOCK};
 
-pub(super) fn blocks(
-    rows: &Rows<'_>,
-    mean: &[i16],
-    begin: usize,
-    at: impl Iterator<Item = usize>,
-    out: &mut [u64],
-) {
-    for from in at {
-        for i in from..from + BLOCK {
-            out[i] = rows.iter().enumerate().fold(0, |bits, (k, (row, other))| {
-                let than = other.map_or(mean[i - begin], |o| o[i]);
-                bits | u64::from(row[i] > than) << k
-            });
+pub(super) fn blocks(rows: &Rows<'_>, out: &mut [u64]) {
+    for (block, out) in out.chunks_exact_mut(BLOCK).enumerate() {
+        out.fill(0);
+        for (k, (codes, than)) in rows.codes.iter().zip(rows.than).enumerate() {
+            let pairs = codes[block * BLOCK..].iter().zip(&than[block * BLOCK..]);
+            for (out, (code, than)) in out.iter_mut().zip(pairs) {
+                *out |= u64::from(code > than) << k;
+            }
         }
     }
 }
