@@ -7,6 +7,7 @@ use super::{
     CoarseMap, INVALID,
     descriptor::{Descriptors, MARGIN},
     search::UNSURE_COST,
+    shared,
 };
 use crate::{Image, Level, lanes::vectorised, parallel::PerThread};
 
@@ -26,8 +27,6 @@ pub(crate) struct Rows {
     median: Vec<i16>,
     suspect: Vec<u8>,
     claims: Vec<u32>,
-    counterpart: Vec<u32>,
-    owner: Vec<u16>,
 }
 
 /// Replaces outliers of `map` by the median of their 3x3 neighbours, into `out`.
@@ -199,58 +198,15 @@ pub(crate) fn left_right(level: Level, map: &mut CoarseMap, rows: &PerThread<Row
         .par_chunks_mut(width * BAND)
         .zip(map.cost.as_slice().par_chunks(width * BAND))
         .for_each(|(disparity, cost)| {
-            rows.with(|Rows { claims, counterpart, owner, .. }| {
-                counterpart.resize(width, 0);
-                owner.resize(width, 0);
+            rows.with(|Rows { claims, .. }| {
                 for (disparity, cost) in disparity.chunks_mut(width).zip(cost.chunks(width)) {
-                    vectorised!(
-                        level,
-                        counterpart_loop(
-                            disparity: &[i16] = disparity,
-                            counterpart: &mut [u32] = counterpart,
-                        )
-                    );
-                    // One more, which those without a disparity claim.
                     claims.clear();
-                    claims.resize(width + 1, u32::MAX);
-                    for ((x, &at), &c) in (0u32..).zip(counterpart.iter()).zip(cost) {
-                        let claim = &mut claims[at as usize];
-                        *claim = (*claim).min(u32::from(c) << 16 | x);
-                    }
-                    for (owner, &at) in owner.iter_mut().zip(counterpart.iter()) {
-                        *owner = claims[at as usize] as u16;
-                    }
-                    vectorised!(
-                        level,
-                        owner_loop(owner: &[u16] = owner, disparity: &mut [i16] = disparity)
-                    );
+                    claims.resize(width + 2 * shared::BLOCK, u32::MAX);
+                    shared::claim(level, disparity, cost, claims);
+                    shared::keep(level, claims, SHARED_PX, disparity);
                 }
             });
         });
-}
-
-/// The right pixel of each disparity, and the row's width where there is none.
-#[inline(always)]
-fn counterpart_loop(disparity: &[i16], counterpart: &mut [u32]) {
-    // By index: a counter zipped with slices is not vectorised.
-    let n = disparity.len();
-    let counterpart = &mut counterpart[..n];
-    for x in 0..n {
-        let d = disparity[x];
-        let at = (x as i32 - i32::from(d)) as u32;
-        counterpart[x] = if d == INVALID { n as u32 } else { at };
-    }
-}
-
-/// Takes the disparity of those whose right pixel has an owner farther away.
-#[inline(always)]
-fn owner_loop(owner: &[u16], disparity: &mut [i16]) {
-    let n = disparity.len();
-    let owner = &owner[..n];
-    for x in 0..n {
-        let far = owner[x].abs_diff(x as u16) > SHARED_PX;
-        disparity[x] = if far { INVALID } else { disparity[x] };
-    }
 }
 
 #[cfg(test)]

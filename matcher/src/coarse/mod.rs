@@ -9,6 +9,7 @@ mod clean;
 pub(crate) mod descriptor;
 pub(crate) mod hamming;
 mod search;
+mod shared;
 
 use crate::{DisparityRange, Image, Level, StereoStack, parallel::PerThread};
 use descriptor::Descriptors;

@@ -6,7 +6,8 @@ use rayon::prelude::*;
 use super::{
     CoarseMap, INVALID,
     descriptor::{Descriptors, MARGIN},
-    hamming::{BLOCK, Shifts, best_candidates, nearest},
+    hamming::{BLOCK, Shifts, best_candidates, nearest, untaken},
+    shared,
 };
 use crate::{DisparityRange, Image, Level, Sample, lanes::vectorised, parallel::PerThread};
 
@@ -14,6 +15,10 @@ use crate::{DisparityRange, Image, Level, Sample, lanes::vectorised, parallel::P
 pub(crate) const SEED_ROWS: usize = 16;
 /// A seed that differs in more bits is none.
 const SEED_COST: u32 = 14;
+/// A seed that differs in no more bits from what a neighbour found is not looked for elsewhere, as long as
+/// that is no farther from the neighbour's.
+const CLEAR_COST: u32 = 9;
+const SEED_SPREAD: i32 = 2;
 /// A match that differs in more bits than this is looked for over the whole range...
 pub(crate) const UNSURE_COST: u32 = 15;
 /// ...and what is found there must differ in no more than this; with few frames, whose tests reach beyond
@@ -80,9 +85,6 @@ pub(crate) struct Search {
 
 #[derive(Debug, Default)]
 struct Scratch {
-    even: Vec<u64>,
-    odd: Vec<u64>,
-    left: Vec<u64>,
     shifts: Shifts,
     once: Set,
     twice: Set,
@@ -97,12 +99,11 @@ struct Scratch {
 /// Right pixels of a row that no good match has.
 #[derive(Debug, Default)]
 struct Free {
+    /// Whether a match has it, with places before and after the row.
     taken: Vec<u8>,
     /// Their descriptors and columns, side by side.
     descriptors: Vec<u64>,
     columns: Vec<u16>,
-    /// How many lie left of each column.
-    before: Vec<u16>,
 }
 
 /// What a search reads.
@@ -134,7 +135,7 @@ impl Search {
         let scratch = self.scratch.ready();
         self.seeds.par_chunks_mut(half).enumerate().for_each(|(band, seeds)| {
             let y = (band * SEED_ROWS + SEED_ROWS / 2).min(height - 1);
-            scratch.with(|s| seed_row(scene, y, s, seeds));
+            seed_row(scene, y, seeds);
         });
         let seeds = &self.seeds;
         map.disparity
@@ -166,52 +167,71 @@ struct Band<'a> {
     cost: &'a mut [u8],
 }
 
-/// Searches every second pixel of row `y` over the whole range.
-fn seed_row(scene: &Scene<'_>, y: usize, s: &mut Scratch, seeds: &mut [i16]) {
-    let (min, max) = (i64::from(scene.range.min_px), i64::from(scene.range.max_px));
-    let width = scene.left.width() as i64;
-    let right = scene.right.row(y);
-    s.even.clear();
-    s.even.extend(right.iter().step_by(2));
-    s.odd.clear();
-    s.odd.extend(right.iter().skip(1).step_by(2));
-    s.left.clear();
-    s.left.extend(scene.left.row(y)[MARGIN..].iter().step_by(2));
-    s.left.truncate(seeds.len().next_multiple_of(BLOCK));
-    s.left.resize(seeds.len().next_multiple_of(BLOCK), 0);
-    let mut best = [0u32; BLOCK];
-    for block in (0..seeds.len()).step_by(BLOCK) {
-        let x = 2 * block as i64;
-        // Where at least one of the block's pixels has a counterpart.
-        let reach = 2 * BLOCK as i64 - 2;
-        let from = min.max(x - (width - 1));
-        let to = max.min(x + reach);
-        let mut winner = [u64::MAX; BLOCK];
-        for (parity, row) in [(0, &s.even), (1, &s.odd)] {
-            let first = from + (from - parity).rem_euclid(2);
-            let count = if first <= to { (to - first) / 2 + 1 } else { 0 };
-            s.shifts.fill(((first + parity) / 2) as i32, count as usize);
-            let origin = MARGIN / 2 + block;
-            best_candidates(
+/// Searches every second pixel of row `y`: every eighth over the whole range, those between first among
+/// what those beside them found, and over the whole range where that does not match clearly.
+fn seed_row(scene: &Scene<'_>, y: usize, seeds: &mut [i16]) {
+    let width = scene.left.width();
+    let (left, right) = (&scene.left.row(y)[MARGIN..][..width], &scene.right.row(y)[MARGIN..]);
+    let right = &right[..width];
+    let anywhere = |i: usize| {
+        let found = whole_range(scene, left[2 * i], right, 2 * i);
+        found.filter(|(bits, _)| *bits <= SEED_COST).map_or(INVALID, |(_, d)| d as i16)
+    };
+    (0..seeds.len()).step_by(4).for_each(|i| seeds[i] = anywhere(i));
+    for step in [2, 1] {
+        for i in (step..seeds.len()).step_by(2 * step) {
+            let beside = [seeds[i - step], seeds.get(i + step).copied().unwrap_or(INVALID)];
+            let mut found = INVALID;
+            vectorised!(
                 scene.level,
-                &s.left[block..block + BLOCK],
-                row,
-                origin,
-                &s.shifts,
-                &mut best,
+                seed_beside(
+                    value: u64 = left[2 * i],
+                    right: &[u64] = right,
+                    x: i32 = 2 * i as i32,
+                    range: DisparityRange = scene.range,
+                    beside: [i16; 2] = beside,
+                    found: &mut i16 = &mut found,
+                )
             );
-            for (w, b) in winner.iter_mut().zip(best) {
-                let d = first + 2 * i64::from(b & 0xFFFF);
-                *w = (*w).min(u64::from(b >> 16) << 32 | (d - min) as u64);
-            }
-        }
-        for (i, (seed, w)) in seeds[block..].iter_mut().zip(winner).enumerate() {
-            let d = (w & 0xFFFF_FFFF) as i64 + min;
-            let counterpart = x + 2 * i as i64 - d;
-            let good = (w >> 32) as u32 <= SEED_COST && (0..width).contains(&counterpart);
-            *seed = if good { d as i16 } else { INVALID };
+            seeds[i] = if found == INVALID { anywhere(i) } else { found };
         }
     }
+}
+
+/// What a seed's neighbours found, or almost, if it matches clearly.
+#[inline(always)]
+fn seed_beside(
+    value: u64,
+    right: &[u64],
+    x: i32,
+    range: DisparityRange,
+    beside: [i16; 2],
+    found: &mut i16,
+) {
+    let mut least = CLEAR_COST + 1;
+    let [first, second] = beside;
+    let near = first != INVALID && (i32::from(first) - i32::from(second)).abs() <= 1;
+    for d in [first, if near { INVALID } else { second }] {
+        if d == INVALID {
+            continue;
+        }
+        let (from, to) = (i32::from(d) - SEED_SPREAD, i32::from(d) + SEED_SPREAD);
+        for d in from.max(range.min_px)..=to.min(range.max_px) {
+            let Some(other) = right.get((x - d) as usize) else { continue };
+            let bits = (value ^ other).count_ones();
+            if bits < least {
+                (least, *found) = (bits, d as i16);
+            }
+        }
+    }
+}
+
+/// The best match of pixel `x` in a row of right descriptors: bits that differ, and the disparity.
+fn whole_range(scene: &Scene<'_>, value: u64, right: &[u64], x: usize) -> Option<(u32, i32)> {
+    let place = |d: i32| (x as i64 - i64::from(d)).clamp(0, right.len() as i64) as usize;
+    let (from, to) = (place(scene.range.max_px), place(scene.range.min_px - 1));
+    let (bits, at) = nearest(scene.level, value, right.get(from..to)?)?;
+    Some((bits, x as i32 - (from + at) as i32))
 }
 
 /// Searches a block of [`BLOCK`] x [`SEED_ROWS`] pixels from column `x` among its seeds; returns how
@@ -313,42 +333,23 @@ impl Free {
     /// Takes the row's matches.
     fn fill(&mut self, scene: &Scene<'_>, y: usize, disparities: &[i16], costs: &[u8]) {
         let width = disparities.len();
-        // One place more, for those that take none.
         self.taken.clear();
-        match scene.right_mask {
-            Some(mask) => self.taken.extend(mask.row(y).iter().map(|seen| u8::from(*seen == 0))),
-            None => self.taken.resize(width, 0),
+        self.taken.resize(width + 2 * shared::BLOCK, 0);
+        let taken = &mut self.taken[shared::BLOCK..][..width];
+        if let Some(mask) = scene.right_mask {
+            taken.iter_mut().zip(mask.row(y)).for_each(|(to, seen)| *to = u8::from(*seen == 0));
         }
-        self.taken.push(0);
-        for ((x, &d), &cost) in (0i32..).zip(disparities).zip(costs) {
-            // Only disparities with a counterpart inside the image have a cost.
-            let at = if cost <= TAKEN_COST { (x - i32::from(d)) as usize } else { width };
-            self.taken[at] = 1;
-        }
-        self.taken.truncate(width);
-        self.descriptors.resize(width, 0);
-        self.columns.resize(width, 0);
-        self.before.resize(width + 1, 0);
+        shared::take(scene.level, disparities, costs, TAKEN_COST, &mut self.taken);
+        let taken = &self.taken[shared::BLOCK..][..width];
         let row = &scene.right.row(y)[MARGIN..][..width];
-        let mut n = 0;
-        for (x, (taken, descriptor)) in self.taken.iter().zip(row).enumerate() {
-            self.before[x] = n as u16;
-            (self.descriptors[n], self.columns[n]) = (*descriptor, x as u16);
-            n += usize::from(*taken == 0);
-        }
-        self.before[width] = n as u16;
+        untaken(scene.level, taken, row, &mut self.descriptors, &mut self.columns);
     }
 
     /// The whole range for pixel `x`; `None` where nothing matches well.
     fn search(&self, scene: &Scene<'_>, x: usize, value: u64) -> Option<i32> {
-        let last = self.taken.len() as i64 - 1;
-        let from = (x as i64 - i64::from(scene.range.max_px)).max(0);
-        let to = (x as i64 - i64::from(scene.range.min_px)).min(last);
-        if from > to {
-            return None;
-        }
-        let (from, to) = (self.before[from as usize], self.before[to as usize + 1]);
-        let (from, to) = (usize::from(from), usize::from(to));
+        let place = |d: i32| x as i64 - i64::from(d);
+        let from = self.columns.partition_point(|c| i64::from(*c) < place(scene.range.max_px));
+        let to = self.columns.partition_point(|c| i64::from(*c) <= place(scene.range.min_px));
         let (bits, at) = nearest(scene.level, value, &self.descriptors[from..to])?;
         let most = if scene.images.len() < FRAMES_MANY { FOUND_COST_FEW } else { FOUND_COST };
         (bits <= most).then(|| x as i32 - i32::from(self.columns[from + at]))
@@ -465,21 +466,28 @@ fn write_loop(
 fn spans(scene: &Scene<'_>, x: usize, y: usize) -> [i16; BLOCK] {
     let (width, height) = (scene.images[0].width(), scene.images[0].height());
     let mut spans = [0; BLOCK];
-    if x < 2 || x + BLOCK + 2 > width {
-        for (column, to) in spans.iter_mut().enumerate().take(width - x) {
-            *to = span(scene.images, x + column, y);
-        }
-        return spans;
+    // At the left and the right end some pixels on the one side are not the block's, and a few of the
+    // block's are left.
+    let inside = if width < BLOCK + 4 { 0..0 } else { 2..width - 2 };
+    let from = x.min(inside.end.saturating_sub(BLOCK)).max(inside.start);
+    let mut found = [0; BLOCK];
+    if !inside.is_empty() {
+        vectorised!(
+            scene.level,
+            spans_loop(
+                images: &[&Image<Sample>] = scene.images,
+                x: usize = from,
+                rows: [usize; 3] = [y.saturating_sub(2), y, (y + 2).min(height - 1)],
+                spans: &mut [i16; BLOCK] = &mut found,
+            )
+        );
     }
-    vectorised!(
-        scene.level,
-        spans_loop(
-            images: &[&Image<Sample>] = scene.images,
-            x: usize = x,
-            rows: [usize; 3] = [y.saturating_sub(2), y, (y + 2).min(height - 1)],
-            spans: &mut [i16; BLOCK] = &mut spans,
-        )
-    );
+    for (x, to) in (x..width).zip(&mut spans) {
+        *to = match found.get(x.wrapping_sub(from)) {
+            Some(found) if inside.contains(&x) => *found,
+            _ => span(scene.images, x, y),
+        };
+    }
     spans
 }
 

@@ -7,6 +7,8 @@
 
 use crate::{Image, Level, SAMPLES_PER_DN8, Sample, aligned::Aligned, lanes::vectorised};
 
+/// Farthest that a window reaches to either side.
+const REACH: usize = 4;
 /// Pixels of a block.
 pub(super) const BLOCK: usize = 64;
 /// Columns of a row's buffer before the first pixel; at least as many follow the last.
@@ -49,7 +51,7 @@ impl Scale {
         let n = frames as i16;
         if frames < 4 {
             // Units of 64 samples; 81 pixels: 2^16 * 64 / 4 / 81.
-            Self { radius: 4, time: 8192 / n, round: 4 * n, space: 12_945, up: 0, back: 2 }
+            Self { radius: REACH, time: 8192 / n, round: 4 * n, space: 12_945, up: 0, back: 2 }
         } else {
             // Units of 32 samples; 25 pixels: 2^16 * 32 / 4 / 25.
             Self { radius: 2, time: 16_384 / n, round: 2 * n, space: 20_972, up: 1, back: 1 }
@@ -100,12 +102,17 @@ impl Codes {
         );
     }
 
-    /// The codes of a frame `dx` columns and `dy` rows from the pixels of row `y`, the row in work, in
-    /// whole blocks.
-    pub(super) fn row(&self, frame: usize, y: usize, (dx, dy): (isize, isize)) -> &[i8] {
-        let slot = (y + self.scale.radius).wrapping_add_signed(dy) % self.rows();
-        let from = (frame * self.rows() + slot) * self.stride + PAD;
-        &self.codes[from.wrapping_add_signed(dx)..][..self.stride - 2 * PAD]
+    /// The rows around row `y`, the row in work.
+    pub(super) fn around(&self, y: usize) -> Around<'_> {
+        // Rows farther than a window reaches are not asked for.
+        let (number, rows) = (y + self.scale.radius, self.rows());
+        let start = |i: usize| (number + i + rows * REACH - REACH) % rows * self.stride + PAD;
+        Around {
+            codes: &self.codes,
+            starts: std::array::from_fn(start),
+            of_frame: rows * self.stride,
+            len: self.stride - 2 * PAD,
+        }
     }
 
     /// Codes of the windows' means in the row in work, in whole blocks.
@@ -147,6 +154,24 @@ impl Codes {
                 column: &mut [i16] = &mut self.column,
             )
         );
+    }
+}
+
+/// Codes of the rows around one.
+pub(super) struct Around<'a> {
+    codes: &'a [i8],
+    /// Where the first frame's rows begin, from the one [`REACH`] above.
+    starts: [usize; 2 * REACH + 1],
+    of_frame: usize,
+    len: usize,
+}
+
+impl<'a> Around<'a> {
+    /// The codes of a frame `dx` columns and `dy` rows from the pixels of the row, in whole blocks.
+    #[inline]
+    pub(super) fn row(&self, frame: usize, (dx, dy): (isize, isize)) -> &'a [i8] {
+        let start = self.starts[REACH.wrapping_add_signed(dy)];
+        &self.codes[(frame * self.of_frame + start).wrapping_add_signed(dx)..][..self.len]
     }
 }
 

@@ -127,18 +127,20 @@ impl Descriptors {
 
 /// Describes row `y`, in whole blocks.
 fn describe_row(level: Level, tests: &[Test; 64], codes: &Codes, y: usize, out: &mut [u64]) {
-    let own = |frame| codes.row(frame, y, (0, 0));
-    let rows = &Rows {
-        codes: tests.map(|test| match test {
-            Test::Mean { at, frame } => codes.row(frame, y, at),
-            Test::Time { frame, .. } => own(frame),
-        }),
-        than: tests.map(|test| match test {
-            Test::Mean { .. } => codes.mean(),
-            Test::Time { other, .. } => own(other),
-        }),
-        means: tests.iter().filter(|test| matches!(test, Test::Mean { .. })).count(),
-    };
+    let (around, mean) = (codes.around(y), codes.mean());
+    let mut rows = Rows { codes: [mean; 64], than: [mean; 64], means: 0 };
+    for (test, (row, than)) in tests.iter().zip(rows.codes.iter_mut().zip(&mut rows.than)) {
+        match *test {
+            Test::Mean { at, frame } => {
+                *row = around.row(frame, at);
+                rows.means += 1;
+            }
+            Test::Time { frame, other } => {
+                (*row, *than) = (around.row(frame, (0, 0)), around.row(other, (0, 0)));
+            }
+        }
+    }
+    let rows = &rows;
     assert!(out.len().is_multiple_of(BLOCK) && out.as_ptr().addr().is_multiple_of(64));
     assert!(rows.codes.iter().chain(&rows.than).all(|row| row.len() >= out.len()));
     match level {

@@ -17,3 +17,19 @@ pub(super) fn nearest(value: u64, row: &[u64]) -> u64 {
     keys.map(|(i, other)| u64::from((value ^ other).count_ones()) << 32 | i as u64)
         .fold(u64::MAX, u64::min)
 }
+
+/// The number of those that are not taken. What is written behind them does not count.
+pub(super) fn untaken(
+    taken: &[u8],
+    row: &[u64],
+    descriptors: &mut [u64],
+    columns: &mut [u16],
+) -> usize {
+    let mut n = 0;
+    for (x, (taken, descriptor)) in taken.iter().zip(row).enumerate() {
+        // Without a branch.
+        (descriptors[n], columns[n]) = (*descriptor, x as u16);
+        n += usize::from(*taken == 0);
+    }
+    n
+}
