@@ -1,23 +1,21 @@
 //! Cleaning of the coarse map: lone outliers take their neighbours' disparity where they match it as
 //! well, and of several left pixels that claim one right pixel only the best match keeps it.
 
-use rayon::prelude::*;
+use std::ops::Range;
 
 use super::{
-    CoarseMap, INVALID,
-    descriptor::{Descriptors, MARGIN},
-    search::UNSURE_COST,
+    Band, CoarseMap, INVALID,
+    descriptor::MARGIN,
+    search::{Scene, UNSURE_COST},
     shared,
 };
-use crate::{Image, Level, lanes::vectorised, parallel::PerThread};
+use crate::{Level, lanes::vectorised};
 
 /// An outlier that matches better than its neighbours' disparity by more bits stays: a thin object.
 const THIN_BITS: u32 = 5;
 /// Left pixels this near may share a right pixel: a surface seen at a slant.
 const SHARED_PX: u16 = 2;
 
-/// Rows of a task.
-const BAND: usize = 16;
 /// Pixels that are passed over together where none is an outlier.
 const BLOCK: usize = 32;
 
@@ -29,51 +27,92 @@ pub(crate) struct Rows {
     claims: Vec<u32>,
 }
 
-/// Replaces outliers of `map` by the median of their 3x3 neighbours, into `out`.
-pub(crate) fn replace_outliers(
-    level: Level,
-    left: &Descriptors,
-    right: &Descriptors,
-    map: &CoarseMap,
-    rows: &PerThread<Rows>,
-    out: &mut CoarseMap,
+/// Cleans those rows of a band of raw matches whose neighbours are in it.
+pub(super) fn inner_rows(
+    scene: &Scene<'_>,
+    height: usize,
+    raw: &Band<'_>,
+    buffers: &mut Rows,
+    out: &mut Band<'_>,
 ) {
-    let (width, height) = (map.disparity.width(), map.disparity.height());
-    let bands = out.disparity.as_mut_slice().par_chunks_mut(width * BAND);
-    bands.zip(out.cost.as_mut_slice().par_chunks_mut(width * BAND)).enumerate().for_each(
-        |(band, (disparity, cost))| {
-            rows.with(|Rows { median, suspect, .. }| {
-                median.resize(width, 0);
-                suspect.resize(width, 0);
-                let rows = disparity.chunks_mut(width).zip(cost.chunks_mut(width));
-                for (i, (disparity, cost)) in rows.enumerate() {
-                    let y = band * BAND + i;
-                    disparity.copy_from_slice(map.disparity.row(y));
-                    cost.copy_from_slice(map.cost.row(y));
-                    medians(level, &map.disparity, y, height, median);
-                    vectorised!(
-                        level,
-                        suspect_loop(
-                            median: &[i16] = median,
-                            disparity: &[i16] = disparity,
-                            cost: &[u8] = cost,
-                            suspect: &mut [u8] = suspect,
-                        )
-                    );
-                    vectorised!(
-                        level,
-                        settle_loop(
-                            rows: (&[u64], &[u64]) = (left.row(y), right.row(y)),
-                            median: &[i16] = median,
-                            suspect: &[u8] = suspect,
-                            disparity: &mut [i16] = disparity,
-                            cost: &mut [u8] = cost,
-                        )
-                    );
-                }
-            });
-        },
+    let width = raw.width;
+    let row = |y: usize| &raw.disparity[(y - raw.y) * width..][..width];
+    for i in 0..raw.rows() {
+        let y = raw.y + i;
+        if is_inner(y, raw.y..raw.y + raw.rows(), height) {
+            let around = [row(y.saturating_sub(1)), row(y), row((y + 1).min(height - 1))];
+            let costs = &raw.cost[i * width..][..width];
+            clean_row(scene, y, around, costs, buffers, out.row(i));
+        }
+    }
+}
+
+/// Cleans the rows of a band that [`inner_rows`] leaves.
+pub(super) fn outer_rows(
+    scene: &Scene<'_>,
+    raw: &CoarseMap,
+    buffers: &mut Rows,
+    out: &mut Band<'_>,
+) {
+    let height = raw.disparity.height();
+    let rows = out.y..out.y + out.rows();
+    let row = |y: usize| raw.disparity.row(y);
+    for y in rows.clone().filter(|y| !is_inner(*y, rows.clone(), height)) {
+        let around = [row(y.saturating_sub(1)), row(y), row((y + 1).min(height - 1))];
+        clean_row(scene, y, around, raw.cost.row(y), buffers, out.row(y - out.y));
+    }
+}
+
+/// Whether the rows above and below `y` are among `rows`, or outside the image.
+fn is_inner(y: usize, rows: Range<usize>, height: usize) -> bool {
+    (y > rows.start || y == 0) && (y + 1 < rows.end || y + 1 == height)
+}
+
+/// Writes row `y`, without outliers and without those that another left pixel's match excludes, from the
+/// raw rows above, at and below it.
+fn clean_row(
+    scene: &Scene<'_>,
+    y: usize,
+    around: [&[i16]; 3],
+    costs: &[u8],
+    Rows { median, suspect, claims }: &mut Rows,
+    (disparity, cost): (&mut [i16], &mut [u8]),
+) {
+    let (level, width) = (scene.level, disparity.len());
+    median.resize(width, 0);
+    suspect.resize(width, 0);
+    disparity.copy_from_slice(around[1]);
+    cost.copy_from_slice(costs);
+    medians(level, around, median);
+    vectorised!(
+        level,
+        suspect_loop(
+            median: &[i16] = median,
+            disparity: &[i16] = disparity,
+            cost: &[u8] = cost,
+            suspect: &mut [u8] = suspect,
+        )
     );
+    vectorised!(
+        level,
+        settle_loop(
+            rows: (&[u64], &[u64]) = (scene.left.row(y), scene.right.row(y)),
+            median: &[i16] = median,
+            suspect: &[u8] = suspect,
+            disparity: &mut [i16] = disparity,
+            cost: &mut [u8] = cost,
+        )
+    );
+    left_right(level, disparity, cost, claims);
+}
+
+/// The left-right check: a right pixel belongs to the left pixel that matches it best; others that
+/// claim it from farther away are occluded or wrong, and become invalid.
+fn left_right(level: Level, disparity: &mut [i16], cost: &[u8], claims: &mut Vec<u32>) {
+    claims.clear();
+    claims.resize(disparity.len() + 2 * shared::BLOCK, u32::MAX);
+    shared::claim(level, disparity, cost, claims);
+    shared::keep(level, claims, SHARED_PX, disparity);
 }
 
 /// Non-zero where a disparity is another than its neighbours' or matches badly.
@@ -139,10 +178,8 @@ fn settle(median: i16, bits: impl Fn(i32) -> Option<u32>, disparity: &mut i16, c
     }
 }
 
-fn medians(level: Level, map: &Image<i16>, y: usize, height: usize, out: &mut [i16]) {
-    let (above, below) = (map.row(y.saturating_sub(1)), map.row((y + 1).min(height - 1)));
+fn medians(level: Level, [above, row, below]: [&[i16]; 3], out: &mut [i16]) {
     let width = out.len();
-    let row = map.row(y);
     for x in [0, width - 1] {
         let (a, b) = (x.saturating_sub(1), (x + 1).min(width - 1));
         out[x] = median([
@@ -189,26 +226,6 @@ fn median(v: [i16; 9]) -> i16 {
     middle(l0.max(l1).max(l2), middle(m0, m1, m2), h0.min(h1).min(h2))
 }
 
-/// The left-right check: a right pixel belongs to the left pixel that matches it best; others that
-/// claim it from farther away are occluded or wrong, and become invalid.
-pub(crate) fn left_right(level: Level, map: &mut CoarseMap, rows: &PerThread<Rows>) {
-    let width = map.disparity.width();
-    map.disparity
-        .as_mut_slice()
-        .par_chunks_mut(width * BAND)
-        .zip(map.cost.as_slice().par_chunks(width * BAND))
-        .for_each(|(disparity, cost)| {
-            rows.with(|Rows { claims, .. }| {
-                for (disparity, cost) in disparity.chunks_mut(width).zip(cost.chunks(width)) {
-                    claims.clear();
-                    claims.resize(width + 2 * shared::BLOCK, u32::MAX);
-                    shared::claim(level, disparity, cost, claims);
-                    shared::keep(level, claims, SHARED_PX, disparity);
-                }
-            });
-        });
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -233,8 +250,8 @@ mod tests {
         map.cost.set(4, 0, 9);
         map.disparity.set(9, 0, 6);
         map.cost.set(9, 0, 2);
-        let mut rows = PerThread::default();
-        left_right(Level::best(), &mut map, rows.ready());
+        let CoarseMap { disparity, cost } = &mut map;
+        left_right(Level::best(), disparity.as_mut_slice(), cost.as_slice(), &mut Vec::new());
         assert_eq!(map.disparity.get(4, 0), Some(INVALID));
         assert_eq!(map.disparity.get(9, 0), Some(6));
     }

@@ -6,14 +6,17 @@
 //! lost.
 
 mod clean;
+mod dark;
 pub(crate) mod descriptor;
 pub(crate) mod hamming;
 mod search;
 mod shared;
 
+use rayon::prelude::*;
+
 use crate::{DisparityRange, Image, Level, StereoStack, parallel::PerThread};
+pub(crate) use dark::is_dark;
 use descriptor::Descriptors;
-pub(crate) use search::is_dark;
 use search::{Scene, Search};
 
 /// A disparity that is none.
@@ -37,10 +40,43 @@ impl CoarseMap {
         }
     }
 
+    /// Its rows, some at a time.
+    fn bands(&mut self, rows: usize) -> impl IndexedParallelIterator<Item = Band<'_>> {
+        let width = self.disparity.width();
+        let disparities = self.disparity.as_mut_slice().par_chunks_mut(width * rows);
+        let costs = self.cost.as_mut_slice().par_chunks_mut(width * rows);
+        disparities.zip(costs).enumerate().map(move |(band, (disparity, cost))| Band {
+            y: band * rows,
+            width,
+            disparity,
+            cost,
+        })
+    }
+
     fn fit(&mut self, width: usize, height: usize) {
         if (self.disparity.width(), self.disparity.height()) != (width, height) {
             *self = Self::new(width, height);
         }
+    }
+}
+
+/// Rows of a map that a task writes.
+struct Band<'a> {
+    y: usize,
+    width: usize,
+    disparity: &'a mut [i16],
+    cost: &'a mut [u8],
+}
+
+impl Band<'_> {
+    fn rows(&self) -> usize {
+        self.disparity.len() / self.width
+    }
+
+    /// Its `i`th row: disparities and costs.
+    fn row(&mut self, i: usize) -> (&mut [i16], &mut [u8]) {
+        let (from, width) = (i * self.width, self.width);
+        (&mut self.disparity[from..][..width], &mut self.cost[from..][..width])
     }
 }
 
@@ -97,10 +133,7 @@ impl Coarse {
             self.search.run(&scene, map);
             return;
         }
-        self.search.run(&scene, &mut self.raw);
-        let rows = self.rows.ready();
-        clean::replace_outliers(self.level, &self.left, &self.right, &self.raw, rows, map);
-        clean::left_right(self.level, map, rows);
+        self.search.run_clean(&scene, self.rows.ready(), &mut self.raw, map);
     }
 
     /// What [`Coarse::search`] is measured against: every candidate for every pixel.

@@ -4,7 +4,8 @@
 use rayon::prelude::*;
 
 use super::{
-    CoarseMap, INVALID,
+    Band, CoarseMap, INVALID, clean,
+    dark::lit,
     descriptor::{Descriptors, MARGIN},
     hamming::{BLOCK, Shifts, best_candidates, nearest, untaken},
     shared,
@@ -29,8 +30,6 @@ const FOUND_COST_FEW: u32 = 13;
 const TAKEN_COST: u8 = 11;
 /// Fewest frames that are not few.
 const FRAMES_MANY: usize = 6;
-/// Samples over time and the four neighbours span less where no dot is: 3 grey levels.
-const DARK: i16 = 3 * crate::SAMPLES_PER_DN8;
 
 /// Candidates as bits.
 #[derive(Debug, Default, Clone)]
@@ -86,6 +85,8 @@ pub(crate) struct Search {
 #[derive(Debug, Default)]
 struct Scratch {
     shifts: Shifts,
+    /// Candidates of each block.
+    block_shifts: Vec<Shifts>,
     once: Set,
     twice: Set,
     fresh: Set,
@@ -128,43 +129,65 @@ impl Scene<'_> {
 impl Search {
     /// Fills `map` with each pixel's best candidate.
     pub(crate) fn run(&mut self, scene: &Scene<'_>, map: &mut CoarseMap) {
-        let (width, height) = (map.disparity.width(), map.disparity.height());
-        let half = width.div_ceil(2);
-        let bands = height.div_ceil(SEED_ROWS);
-        self.seeds.resize(half * bands, INVALID);
-        let scratch = self.scratch.ready();
+        self.seed(scene, map.disparity.height());
+        let (seeds, scratch) = (&self.seeds, self.scratch.ready());
+        map.bands(SEED_ROWS).for_each(|mut band| {
+            scratch.with(|s| search_band(scene, seeds, s, &mut band));
+        });
+    }
+
+    /// Fills `raw` with each pixel's best candidate, and `map` with that cleaned. Rows whose neighbours
+    /// are in the same band are cleaned while their descriptors are still in the cache.
+    pub(crate) fn run_clean(
+        &mut self,
+        scene: &Scene<'_>,
+        rows: &PerThread<clean::Rows>,
+        raw: &mut CoarseMap,
+        map: &mut CoarseMap,
+    ) {
+        let height = raw.disparity.height();
+        self.seed(scene, height);
+        let (seeds, scratch) = (&self.seeds, self.scratch.ready());
+        raw.bands(SEED_ROWS).zip(map.bands(SEED_ROWS)).for_each(|(mut band, mut cleaned)| {
+            scratch.with(|s| search_band(scene, seeds, s, &mut band));
+            rows.with(|rows| clean::inner_rows(scene, height, &band, rows, &mut cleaned));
+        });
+        map.bands(SEED_ROWS).for_each(|mut cleaned| {
+            rows.with(|rows| clean::outer_rows(scene, raw, rows, &mut cleaned));
+        });
+    }
+
+    /// Finds the seeds of every band.
+    fn seed(&mut self, scene: &Scene<'_>, height: usize) {
+        let half = scene.left.width().div_ceil(2);
+        self.seeds.resize(half * height.div_ceil(SEED_ROWS), INVALID);
         self.seeds.par_chunks_mut(half).enumerate().for_each(|(band, seeds)| {
             let y = (band * SEED_ROWS + SEED_ROWS / 2).min(height - 1);
             seed_row(scene, y, seeds);
         });
-        let seeds = &self.seeds;
-        map.disparity
-            .as_mut_slice()
-            .par_chunks_mut(width * SEED_ROWS)
-            .zip(map.cost.as_mut_slice().par_chunks_mut(width * SEED_ROWS))
-            .enumerate()
-            .for_each(|(band, (disparity, cost))| {
-                let first = band.saturating_sub(1) * half;
-                let last = (band + 2).min(bands) * half;
-                let mut out = Band { y: band * SEED_ROWS, width, disparity, cost };
-                scratch.with(|s| {
-                    s.unsure.clear();
-                    for x in (0..width).step_by(BLOCK) {
-                        let unsure = search_block(scene, &seeds[first..last], x, s, &mut out);
-                        s.unsure.push(unsure);
-                    }
-                    search_unsure(scene, s, &mut out);
-                });
-            });
     }
 }
 
-/// Rows of the result that a task writes.
-struct Band<'a> {
-    y: usize,
-    width: usize,
-    disparity: &'a mut [i16],
-    cost: &'a mut [u8],
+/// Searches a band among its own seeds and those of the bands beside it.
+fn search_band(scene: &Scene<'_>, seeds: &[i16], s: &mut Scratch, out: &mut Band<'_>) {
+    let half = out.width.div_ceil(2);
+    let band = out.y / SEED_ROWS;
+    let seeds = &seeds[band.saturating_sub(1) * half..seeds.len().min((band + 2) * half)];
+    let blocks = out.width.div_ceil(BLOCK);
+    // As many as there can be: bands need different numbers.
+    s.block_shifts.resize_with(blocks, || Shifts::with_capacity(scene.count()));
+    for block in 0..blocks {
+        block_candidates(scene, seeds, block * BLOCK, out.width, s);
+    }
+    s.unsure.clear();
+    s.unsure.resize(blocks, 0);
+    // Row by row, as descriptors lie in memory.
+    for row in 0..out.rows() {
+        for (block, (shifts, unsure)) in s.block_shifts.iter().zip(&mut s.unsure).enumerate() {
+            *unsure += match_row(scene, (block * BLOCK, row), shifts, false, out);
+        }
+    }
+    search_unsure(scene, s, out);
 }
 
 /// Searches every second pixel of row `y`: every eighth over the whole range, those between first among
@@ -234,18 +257,11 @@ fn whole_range(scene: &Scene<'_>, value: u64, right: &[u64], x: usize) -> Option
     Some((bits, x as i32 - (from + at) as i32))
 }
 
-/// Searches a block of [`BLOCK`] x [`SEED_ROWS`] pixels from column `x` among its seeds; returns how
-/// many pixels are unsure.
-fn search_block(
-    scene: &Scene<'_>,
-    seeds: &[i16],
-    x: usize,
-    s: &mut Scratch,
-    out: &mut Band<'_>,
-) -> u32 {
+/// What a block of [`BLOCK`] columns from `x` tries: what the seeds around it found, and almost.
+fn block_candidates(scene: &Scene<'_>, seeds: &[i16], x: usize, width: usize, s: &mut Scratch) {
     let count = scene.count();
     let min = scene.range.min_px;
-    let half = out.width.div_ceil(2);
+    let half = width.div_ceil(2);
     s.once.clear(count);
     s.twice.clear(count);
     let from = (x / 2).saturating_sub(BLOCK / 4);
@@ -266,8 +282,7 @@ fn search_block(
         let (up, down) = s.once.beside(i);
         s.fresh.words[i] = s.once.words[i] & (s.twice.words[i] | up | down);
     }
-    shifts_for(scene, &s.fresh, x, out.width, &mut s.shifts);
-    match_block(scene, x, &s.shifts, false, out)
+    shifts_for(scene, &s.fresh, x, width, &mut s.block_shifts[x / BLOCK]);
 }
 
 /// Looks for the unsure pixels of a band over the whole range: every fourth of them does, and what they
@@ -283,8 +298,7 @@ fn search_unsure(scene: &Scene<'_>, s: &mut Scratch, out: &mut Band<'_>) {
     let empty = || Set { words: Vec::with_capacity(count.div_ceil(64)) };
     s.found.resize_with(s.unsure.len(), empty);
     s.found.iter_mut().for_each(|found| found.words.clear());
-    let rows = out.disparity.len() / out.width;
-    for row in (0..rows).step_by(2) {
+    for row in (0..out.rows()).step_by(2) {
         let y = out.y + row;
         let costs = &out.cost[row * out.width..][..out.width];
         let left_mask = scene.left_mask.map(|mask| mask.row(y));
@@ -305,8 +319,8 @@ fn search_unsure(scene: &Scene<'_>, s: &mut Scratch, out: &mut Band<'_>) {
             if columns.peek().is_none() {
                 continue;
             }
-            let spans = spans(scene, x, y);
-            for column in columns.filter(|&column| spans[column] >= DARK) {
+            let lit = lit(scene.level, scene.images, (x, y), columns.clone());
+            for column in columns.filter(|column| lit >> column & 1 != 0) {
                 if !ready {
                     let disparities = &out.disparity[row * out.width..][..out.width];
                     s.free.fill(scene, y, disparities, costs);
@@ -325,7 +339,9 @@ fn search_unsure(scene: &Scene<'_>, s: &mut Scratch, out: &mut Band<'_>) {
     }
     for (block, found) in s.found.iter().enumerate().filter(|(_, found)| !found.words.is_empty()) {
         shifts_for(scene, found, block * BLOCK, out.width, &mut s.shifts);
-        match_block(scene, block * BLOCK, &s.shifts, true, out);
+        for row in 0..out.rows() {
+            match_row(scene, (block * BLOCK, row), &s.shifts, true, out);
+        }
     }
 }
 
@@ -370,41 +386,38 @@ fn shifts_for(scene: &Scene<'_>, set: &Set, x: usize, width: usize, shifts: &mut
     });
 }
 
-/// Matches a block's rows; with `better`, takes only what costs less than what is there. Returns the
-/// unsure pixels.
-fn match_block(
+/// Matches [`BLOCK`] pixels of a band's row from column `x`; with `better`, takes only what costs less than
+/// what is there. Returns how many pixels are unsure.
+fn match_row(
     scene: &Scene<'_>,
-    x: usize,
+    (x, row): (usize, usize),
     shifts: &Shifts,
     better: bool,
     out: &mut Band<'_>,
 ) -> u32 {
+    let (y, from) = (out.y + row, row * out.width + x);
     let columns = BLOCK.min(out.width - x);
-    let rows = out.disparity.chunks_mut(out.width).zip(out.cost.chunks_mut(out.width));
+    let left = &scene.left.row(y)[MARGIN + x..][..BLOCK];
+    let mut best = [0; BLOCK];
+    best_candidates(scene.level, left, scene.right.row(y), MARGIN + x, shifts, &mut best);
+    let disparity = &mut out.disparity[from..][..columns];
+    let cost = &mut out.cost[from..][..columns];
+    let at = (x as i32, out.width as i32);
     let mut unsure = 0;
-    for (y, (disparity, cost)) in (out.y..).zip(rows) {
-        let left = &scene.left.row(y)[MARGIN + x..][..BLOCK];
-        let mut best = [0; BLOCK];
-        best_candidates(scene.level, left, scene.right.row(y), MARGIN + x, shifts, &mut best);
-        let (disparity, cost) = (&mut disparity[x..][..columns], &mut cost[x..][..columns]);
-        let at = (x as i32, out.width as i32);
-        // Loops of a known length have no remainder, which would not be by vectors.
-        let whole = disparity.first_chunk_mut::<BLOCK>().zip(cost.first_chunk_mut::<BLOCK>());
-        if let Some((disparity, cost)) = whole {
-            write_row(scene.level, &best, shifts.first(), at, better, disparity, cost, &mut unsure);
-            continue;
-        }
-        let (mut disparities, mut costs) = ([INVALID; BLOCK], [0; BLOCK]);
-        disparities[..columns].copy_from_slice(disparity);
-        costs[..columns].copy_from_slice(cost);
-        let (to, costs_to, mut beyond) = (&mut disparities, &mut costs, 0);
-        write_row(scene.level, &best, shifts.first(), at, better, to, costs_to, &mut beyond);
-        let unsure_here = costs[..columns].iter().filter(|c| u32::from(**c) > UNSURE_COST);
-        unsure += unsure_here.count() as u32;
-        disparity.copy_from_slice(&disparities[..columns]);
-        cost.copy_from_slice(&costs[..columns]);
+    // Loops of a known length have no remainder, which would not be by vectors.
+    let whole = disparity.first_chunk_mut::<BLOCK>().zip(cost.first_chunk_mut::<BLOCK>());
+    if let Some((disparity, cost)) = whole {
+        write_row(scene.level, &best, shifts.first(), at, better, disparity, cost, &mut unsure);
+        return unsure;
     }
-    unsure
+    let (mut disparities, mut costs) = ([INVALID; BLOCK], [0; BLOCK]);
+    disparities[..columns].copy_from_slice(disparity);
+    costs[..columns].copy_from_slice(cost);
+    let (to, costs_to) = (&mut disparities, &mut costs);
+    write_row(scene.level, &best, shifts.first(), at, better, to, costs_to, &mut unsure);
+    disparity.copy_from_slice(&disparities[..columns]);
+    cost.copy_from_slice(&costs[..columns]);
+    cost.iter().filter(|c| u32::from(**c) > UNSURE_COST).count() as u32
 }
 
 /// Takes over the best candidates of a block's row, which begins at column `at.0` of `at.1`.
@@ -459,72 +472,4 @@ fn write_loop(
         count += u32::from(u32::from(cost[i]) > UNSURE_COST);
     }
     *unsure += count;
-}
-
-/// By how much the samples of a block's pixels in row `y` span over time and the neighbours two pixels
-/// away: what [`is_dark`] looks at.
-fn spans(scene: &Scene<'_>, x: usize, y: usize) -> [i16; BLOCK] {
-    let (width, height) = (scene.images[0].width(), scene.images[0].height());
-    let mut spans = [0; BLOCK];
-    // At the left and the right end some pixels on the one side are not the block's, and a few of the
-    // block's are left.
-    let inside = if width < BLOCK + 4 { 0..0 } else { 2..width - 2 };
-    let from = x.min(inside.end.saturating_sub(BLOCK)).max(inside.start);
-    let mut found = [0; BLOCK];
-    if !inside.is_empty() {
-        vectorised!(
-            scene.level,
-            spans_loop(
-                images: &[&Image<Sample>] = scene.images,
-                x: usize = from,
-                rows: [usize; 3] = [y.saturating_sub(2), y, (y + 2).min(height - 1)],
-                spans: &mut [i16; BLOCK] = &mut found,
-            )
-        );
-    }
-    for (x, to) in (x..width).zip(&mut spans) {
-        *to = match found.get(x.wrapping_sub(from)) {
-            Some(found) if inside.contains(&x) => *found,
-            _ => span(scene.images, x, y),
-        };
-    }
-    spans
-}
-
-#[inline(always)]
-fn spans_loop(images: &[&Image<Sample>], x: usize, rows: [usize; 3], spans: &mut [i16; BLOCK]) {
-    let (mut low, mut high) = ([i16::MAX; BLOCK], [i16::MIN; BLOCK]);
-    for image in images {
-        let [above, own, below] = rows.map(|y| image.row(y));
-        for samples in [&above[x..], &own[x - 2..], &own[x..], &own[x + 2..], &below[x..]] {
-            let samples = &samples[..BLOCK];
-            for i in 0..BLOCK {
-                low[i] = low[i].min(samples[i]);
-                high[i] = high[i].max(samples[i]);
-            }
-        }
-    }
-    for i in 0..BLOCK {
-        spans[i] = high[i].saturating_sub(low[i]);
-    }
-}
-
-/// Whether no dot ever lights the pixel or its neighbours two pixels away.
-pub(crate) fn is_dark(images: &[&Image<Sample>], x: usize, y: usize) -> bool {
-    span(images, x, y) < DARK
-}
-
-fn span(images: &[&Image<Sample>], x: usize, y: usize) -> i16 {
-    let (width, height) = (images[0].width(), images[0].height());
-    let columns = [x.saturating_sub(2), x, (x + 2).min(width - 1)];
-    let rows = [y.saturating_sub(2), (y + 2).min(height - 1)];
-    let (mut low, mut high) = (i16::MAX, i16::MIN);
-    for image in images {
-        let row = image.row(y);
-        let beside = columns.map(|c| row[c]);
-        for v in beside.into_iter().chain(rows.map(|r| image.row(r)[x])) {
-            (low, high) = (low.min(v), high.max(v));
-        }
-    }
-    high.saturating_sub(low)
 }

@@ -19,6 +19,11 @@ pub(crate) const BLOCK: usize = 32;
 pub(crate) struct Shifts(Vec<i32>);
 
 impl Shifts {
+    /// None yet, with place for `count`.
+    pub(crate) fn with_capacity(count: usize) -> Self {
+        Self(Vec::with_capacity(count))
+    }
+
     pub(crate) fn clear(&mut self) {
         self.0.clear();
     }
