@@ -10,7 +10,8 @@ use rayon::prelude::*;
 use super::DenseMaps;
 use crate::{
     Image, Level, StereoStack,
-    step::{BLOCK, FRAMES_MIN, Limits, StepJudge, for_columns},
+    lanes::vectorised,
+    step::{BLOCK, FRAMES_MIN, Limits, Samples, StepJudge, for_columns},
 };
 
 /// Coarse windows reach up to five pixels beyond a silhouette that nothing lit lies behind.
@@ -20,6 +21,16 @@ const LIMITS: Limits =
 /// Where the two orders differ by more, the second is judged: the first one's window is too coarse.
 const FINE_PX: f32 = 0.03;
 
+/// Least similarity over time of a single pixel near a step and its place in the right images, at the end:
+/// what a window gave to a pixel that shows something else is wrong by millimetres. Few and dark as such
+/// pixels are, they made three quarters of the squared error of the simulated part...
+const OWN_SIMILARITY_MIN: f32 = 0.75;
+/// ...but where the light is weak, noise takes as much from a pixel that is right: it may lack so many times
+/// the loss of ZNCC that windows of the whole image have in the median.
+const OWN_LOSS: f32 = 8.0;
+/// Pixels from one ZNCC that the median looks at to the next.
+const SAMPLE: usize = 97;
+
 /// Settles depth steps; keeps its buffers between frames.
 #[derive(Debug)]
 pub struct Settle {
@@ -28,6 +39,8 @@ pub struct Settle {
     /// Blocks with steps, and these with the blocks around.
     blocks: Image<bool>,
     around: Image<bool>,
+    level: Level,
+    losses: Vec<f32>,
 }
 
 impl Settle {
@@ -38,6 +51,8 @@ impl Settle {
             judged: Image::new(0, 0, f32::NAN),
             blocks: Image::new(0, 0, false),
             around: Image::new(0, 0, false),
+            level: level.usable(),
+            losses: Vec::new(),
         }
     }
 
@@ -85,6 +100,47 @@ impl Settle {
             maps.first_px.as_mut_slice()[i] = to;
             maps.second_px.as_mut_slice()[i] = to;
         }
+        self.verify(stack, start, maps);
+    }
+
+    /// Takes away the points near steps whose own grey values do not agree with their place.
+    fn verify(&mut self, stack: &StereoStack<'_>, start: &mut Image<f32>, maps: &mut DenseMaps) {
+        let width = stack.width();
+        let least = self.own_similarity_min(&maps.zncc);
+        let (samples, level) = (Samples::new(stack), self.level);
+        let (judged, blocks) = (&self.judged, &self.around);
+        let near = self.judge.near_in(blocks);
+        let starts = start.as_mut_slice().par_chunks_mut(width);
+        let rows = maps.first_px.as_mut_slice().par_chunks_mut(width);
+        let rows = rows.zip(maps.second_px.as_mut_slice().par_chunks_mut(width)).zip(starts);
+        rows.enumerate().for_each(|(y, ((first, second), start))| {
+            for_columns(Some(blocks), y, width, |from, to| {
+                vectorised!(
+                    level,
+                    verify_loop(
+                        samples: &Samples<'_> = &samples,
+                        at: (usize, usize) = (from, y),
+                        least: f32 = least,
+                        found: (&[f32], &[u8]) =
+                            (&judged.row(y)[from..to], &near.row(y)[from..to]),
+                        maps: [&mut [f32]; 3] =
+                            [&mut first[from..to], &mut second[from..to], &mut start[from..to]],
+                    )
+                );
+            });
+        });
+    }
+
+    fn own_similarity_min(&mut self, zncc: &Image<f32>) -> f32 {
+        let known = zncc.as_slice().iter().step_by(SAMPLE).filter(|z| !z.is_nan());
+        self.losses.clear();
+        self.losses.extend(known.map(|z| 1.0 - z));
+        let middle = self.losses.len() / 2;
+        if self.losses.is_empty() {
+            return OWN_SIMILARITY_MIN;
+        }
+        let (_, loss, _) = self.losses.select_nth_unstable_by(middle, f32::total_cmp);
+        OWN_SIMILARITY_MIN.min(1.0 - OWN_LOSS * *loss)
     }
 
     /// Marks the blocks that hold a step, and the blocks around.
@@ -105,6 +161,27 @@ impl Settle {
                     self.around.row_mut(y)[across].fill(true);
                 }
             }
+        }
+    }
+}
+
+/// Makes NaN what `maps` have where `found` has a disparity, and a mark, and the grey values at both places
+/// are less similar than `least`; where the right camera's view ends, nothing is said.
+#[inline(always)]
+fn verify_loop(
+    samples: &Samples<'_>,
+    (from, y): (usize, usize),
+    least: f32,
+    (disparity_px, marks): (&[f32], &[u8]),
+    maps: [&mut [f32]; 3],
+) {
+    let [first, second, start] = maps;
+    for (k, (&d, &mark)) in disparity_px.iter().zip(marks).enumerate() {
+        if mark == 0 || d.is_nan() {
+            continue;
+        }
+        if samples.signature(from + k, y, d).is_some_and(|s| s.similarity() < least) {
+            (first[k], second[k], start[k]) = (f32::NAN, f32::NAN, f32::NAN);
         }
     }
 }

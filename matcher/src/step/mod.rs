@@ -28,6 +28,7 @@ use crate::{Image, Level, StereoStack, lanes::vectorised, parallel::PerThread, r
 use candidates::plane;
 use decide::Judge;
 pub use decide::{FRAMES_MIN, LIGHT_MIN, NEXT_LIGHT_MIN, SIMILARITY_MIN};
+pub(crate) use signature::Samples;
 
 /// Disparities of neighbours that differ by more belong to different surfaces.
 pub const JUMP_PX: f32 = 1.5;
@@ -229,7 +230,13 @@ impl StepJudge {
     /// The pixels (non-zero) near the steps of the last map judged: subsets there may hold another
     /// surface.
     pub fn near(&mut self) -> &Image<u8> {
-        self.mark_near();
+        self.mark_near(None);
+        &self.near
+    }
+
+    /// As [`Self::near`], told of the blocks set only.
+    pub(crate) fn near_in(&mut self, blocks: &Image<bool>) -> &Image<u8> {
+        self.mark_near(Some(blocks));
         &self.near
     }
 
@@ -263,22 +270,29 @@ impl StepJudge {
         });
     }
 
-    /// Marks all pixels within [`NEAR_RADIUS`] of those beside steps.
-    fn mark_near(&mut self) {
+    /// Marks all pixels within [`NEAR_RADIUS`] of those beside steps, in the blocks set.
+    fn mark_near(&mut self, blocks: Option<&Image<bool>>) {
         let (width, height) = (self.beside.width(), self.beside.height());
         if (self.near.width(), self.near.height()) != (width, height) {
             self.near = Image::new(width, height, 0);
         }
         let (level, beside, columns) = (self.level, &self.beside, self.columns.ready());
         self.near.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, out)| {
-            columns.with(|column| {
-                column.clear();
-                column.resize(width + 2 * NEAR_RADIUS, 0);
-                for row in y.saturating_sub(NEAR_RADIUS)..(y + NEAR_RADIUS + 1).min(height) {
-                    let marks = column[NEAR_RADIUS..].iter_mut().zip(beside.row(row));
-                    marks.for_each(|(c, b)| *c |= b);
-                }
-                vectorised!(level, widen(column: &[u8] = column, out: &mut [u8] = out));
+            let rows = y.saturating_sub(NEAR_RADIUS)..(y + NEAR_RADIUS + 1).min(height);
+            for_columns(blocks, y, width, |from, to| {
+                columns.with(|column| {
+                    let (left, right) =
+                        (from.saturating_sub(NEAR_RADIUS), (to + NEAR_RADIUS).min(width));
+                    column.clear();
+                    column.resize(to - from + 2 * NEAR_RADIUS, 0);
+                    for row in rows.clone() {
+                        let marks = beside.row(row)[left..right].iter();
+                        let column = &mut column[left + NEAR_RADIUS - from..];
+                        column.iter_mut().zip(marks).for_each(|(c, b)| *c |= b);
+                    }
+                    let out = &mut out[from..to];
+                    vectorised!(level, widen(column: &[u8] = column, out: &mut [u8] = out));
+                });
             });
         });
     }

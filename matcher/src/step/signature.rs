@@ -34,7 +34,7 @@ impl Signature {
 const FRAMES_MOST: usize = 16;
 
 /// A stack's grey values, at hand.
-pub(super) struct Samples<'a> {
+pub(crate) struct Samples<'a> {
     stack: &'a StereoStack<'a>,
     frames: [(&'a [Sample], &'a [Sample]); FRAMES_MOST],
 }
