@@ -33,6 +33,8 @@ pub struct Class {
     pub outliers: f64,
     /// RMS along the ray of the points within 5 mm, in millimetres.
     pub rms_mm: f64,
+    /// RMS of their distance from the true surface, in millimetres.
+    pub normal_rms_mm: f64,
     /// Their part in the sum of squared errors of all.
     pub share: f64,
 }
@@ -45,6 +47,7 @@ struct Sums {
     wrong: usize,
     good: usize,
     squares_mm2: f64,
+    normal_mm2: f64,
 }
 
 /// A way to class pixels.
@@ -86,7 +89,8 @@ pub fn budget(frame: &DepthFrame, truth: &CanvasTruth) -> Vec<Class> {
                 one.missing = 1;
             } else if error.abs() <= OUTLIER_M {
                 let along = truth.error_along_ray_m(x, y, z) * 1e3;
-                (one.good, one.squares_mm2) = (1, along * along);
+                let normal = truth.error_normal_m(x, y, z) * 1e3;
+                (one.good, one.squares_mm2, one.normal_mm2) = (1, along * along, normal * normal);
             } else {
                 one.wrong = 1;
             }
@@ -111,6 +115,7 @@ pub fn budget(frame: &DepthFrame, truth: &CanvasTruth) -> Vec<Class> {
                 to.wrong += one.wrong;
                 to.good += one.good;
                 to.squares_mm2 += one.squares_mm2;
+                to.normal_mm2 += one.normal_mm2;
             }
         }
     }
@@ -133,6 +138,7 @@ pub fn budget(frame: &DepthFrame, truth: &CanvasTruth) -> Vec<Class> {
             missing: part(s.missing, visible),
             outliers: part(s.wrong, points),
             rms_mm: (s.squares_mm2 / s.good.max(1) as f64).sqrt(),
+            normal_rms_mm: (s.normal_mm2 / s.good.max(1) as f64).sqrt(),
             share: s.squares_mm2 / squares_mm2.max(f64::MIN_POSITIVE),
         })
         .collect()
@@ -264,19 +270,20 @@ fn bend(disparity: &Image<f32>, x: usize, y: usize) -> f32 {
 /// Classes as text columns.
 pub fn to_text(classes: &[Class]) -> String {
     let mut text = format!(
-        "{:<18} {:<12} {:>9} {:>9} {:>9} {:>9} {:>9}\n",
-        "class", "", "visible %", "missing %", "outlier %", "RMS mm", "share %"
+        "{:<18} {:<12} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9}\n",
+        "class", "", "visible %", "missing %", "outlier %", "ray mm", "normal mm", "share %"
     );
     for c in classes {
         let _ = writeln!(
             text,
-            "{:<18} {:<12} {:>9.2} {:>9.3} {:>9.4} {:>9.4} {:>9.1}",
+            "{:<18} {:<12} {:>9.2} {:>9.3} {:>9.4} {:>9.4} {:>9.4} {:>9.1}",
             c.group,
             c.range,
             100.0 * c.visible,
             100.0 * c.missing,
             100.0 * c.outliers,
             c.rms_mm,
+            c.normal_rms_mm,
             100.0 * c.share
         );
     }

@@ -27,6 +27,10 @@ pub struct Score {
     pub outliers_visible: f64,
     /// RMS of the error along the ray over points within 5 mm, in millimetres.
     pub surface_rms_mm: f64,
+    /// RMS of the same points' distance from the true surface, along its normal, in millimetres: what a
+    /// comparison of the cloud with the surface gives. Where a surface is seen at a grazing angle it is a
+    /// fraction of the error along the ray.
+    pub normal_rms_mm: f64,
     /// Median of that error's magnitude, in millimetres.
     pub surface_median_mm: f64,
 }
@@ -34,23 +38,24 @@ pub struct Score {
 /// Compares a frame with the truth.
 pub fn score(frame: &DepthFrame, truth: &CanvasTruth) -> Score {
     let (mut points, mut visible, mut good, mut wrong, mut wrong_visible) = (0, 0, 0, 0, 0);
-    let mut errors_mm = Vec::new();
-    let pixels = frame.depth_m.as_slice().iter().zip(truth.depth_m.as_slice());
-    let more = truth.distance_m.as_slice().iter().zip(truth.visible_to_both.as_slice());
-    for ((z, true_z), (distance, both)) in pixels.zip(more) {
-        let both = *both != 0;
-        visible += usize::from(both);
-        if !z.is_finite() {
-            continue;
-        }
-        points += 1;
-        let error = z - true_z;
-        if error.abs() <= OUTLIER_M {
-            good += usize::from(both);
-            errors_mm.push(f64::from(error) * f64::from(distance / true_z) * 1e3);
-        } else {
-            wrong += 1;
-            wrong_visible += usize::from(both);
+    let (mut errors_mm, mut normal_mm) = (Vec::new(), Vec::new());
+    for y in 0..frame.depth_m.height() {
+        let pixels = frame.depth_m.row(y).iter().zip(truth.depth_m.row(y));
+        for (x, ((z, true_z), both)) in pixels.zip(truth.visible_to_both.row(y)).enumerate() {
+            let both = *both != 0;
+            visible += usize::from(both);
+            if !z.is_finite() {
+                continue;
+            }
+            points += 1;
+            if (z - true_z).abs() <= OUTLIER_M {
+                good += usize::from(both);
+                errors_mm.push(truth.error_along_ray_m(x, y, *z) * 1e3);
+                normal_mm.push(truth.error_normal_m(x, y, *z) * 1e3);
+            } else {
+                wrong += 1;
+                wrong_visible += usize::from(both);
+            }
         }
     }
     let part = |n: usize, of: usize| n as f64 / of.max(1) as f64;
@@ -70,6 +75,7 @@ pub fn score(frame: &DepthFrame, truth: &CanvasTruth) -> Score {
         outliers: part(wrong, points),
         outliers_visible: part(wrong_visible, points),
         surface_rms_mm,
+        normal_rms_mm: rms(normal_mm),
         surface_median_mm,
     }
 }

@@ -204,7 +204,7 @@ impl Case {
 
 /// Lines as text columns.
 pub fn to_text(lines: &[Line]) -> String {
-    const HEADS: [(&str, &str, usize); 16] = [
+    const HEADS: [(&str, &str, usize); 17] = [
         ("scene", "", 16),
         ("N", "", 2),
         ("method", "", 9),
@@ -217,12 +217,13 @@ pub fn to_text(lines: &[Line]) -> String {
         ("points", "", 8),
         ("complete", "%", 9),
         ("outliers", "%", 9),
-        ("surf RMS", "mm", 9),
+        ("ray RMS", "mm", 9),
+        ("normal", "mm", 9),
         ("median", "mm", 9),
         ("full", "%", 7),
         ("match", "ms", 8),
     ];
-    let row = |cells: [String; 16]| {
+    let row = |cells: [String; 17]| {
         let cells = cells.iter().zip(HEADS).enumerate().map(|(k, (cell, (_, _, width)))| {
             if k == 0 || k == 2 || k == 3 {
                 format!("{cell:<width$}")
@@ -251,6 +252,7 @@ pub fn to_text(lines: &[Line]) -> String {
             format!("{:.3}", 100.0 * score.completeness),
             format!("{:.4}", 100.0 * score.outliers),
             format!("{:.4}", score.surface_rms_mm),
+            format!("{:.4}", score.normal_rms_mm),
             format!("{:.4}", score.surface_median_mm),
             format!("{:.3}", 100.0 * line.saturated),
             format!("{:.0}", line.match_wall_ms),

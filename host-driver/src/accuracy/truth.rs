@@ -19,12 +19,15 @@ pub struct CanvasTruth {
     /// Angle between the surface's normal and the direction to the camera that sees it at the more
     /// grazing angle, in degrees; NaN where there is nothing.
     pub incidence_deg: Image<f32>,
+    /// Cosine of the angle between the normal and the ray of the left camera, which is what an error along
+    /// the ray shrinks by to a distance from the surface; NaN where there is nothing.
+    pub cosine_left: Image<f32>,
     /// Non-zero where the right camera sees the same surface.
     pub visible_to_both: Image<u8>,
 }
 
-/// Depth, distance, incidence, object and visibility of a pixel.
-type Pixel = (f32, f32, f32, u8, u8);
+/// Depth, distance, incidence, its cosine on the left, object and visibility of a pixel.
+type Pixel = (f32, f32, f32, f32, u8, u8);
 
 impl CanvasTruth {
     /// Traces the rays of all pixels that the left camera saw (`left_mask`).
@@ -40,7 +43,7 @@ impl CanvasTruth {
         let rows: Vec<Vec<Pixel>> = (0..height)
             .into_par_iter()
             .map(|y| {
-                let nothing = (f32::NAN, f32::NAN, f32::NAN, 0, 0);
+                let nothing = (f32::NAN, f32::NAN, f32::NAN, f32::NAN, 0, 0);
                 let pixel = |x: usize| {
                     if left_mask.get(x, y) == Some(0) {
                         return nothing;
@@ -59,11 +62,13 @@ impl CanvasTruth {
                         let direction = (centre_left_m - surface.point_left_m).normalize();
                         direction.dot(&surface.normal_left).clamp(-1.0, 1.0)
                     };
-                    let cosine = towards(Vector3::zeros()).min(towards(right_centre_left_m));
+                    let cosine_left = towards(Vector3::zeros());
+                    let cosine = cosine_left.min(towards(right_centre_left_m));
                     (
                         surface.point_left_m.z as f32,
                         surface.distance_m as f32,
                         cosine.acos().to_degrees() as f32,
+                        cosine_left as f32,
                         u8::try_from(surface.object + 1).unwrap_or(u8::MAX),
                         u8::from(both),
                     )
@@ -83,8 +88,9 @@ impl CanvasTruth {
             depth_m: image(flat().map(|p| p.0).collect()),
             distance_m: image(flat().map(|p| p.1).collect()),
             incidence_deg: image(flat().map(|p| p.2).collect()),
-            object: bytes(flat().map(|p| p.3).collect()),
-            visible_to_both: bytes(flat().map(|p| p.4).collect()),
+            cosine_left: image(flat().map(|p| p.3).collect()),
+            object: bytes(flat().map(|p| p.4).collect()),
+            visible_to_both: bytes(flat().map(|p| p.5).collect()),
         }
     }
 
@@ -92,5 +98,11 @@ impl CanvasTruth {
     pub fn error_along_ray_m(&self, x: usize, y: usize, depth_m: f32) -> f64 {
         let true_m = self.depth_m.row(y)[x];
         f64::from(depth_m - true_m) * f64::from(self.distance_m.row(y)[x] / true_m)
+    }
+
+    /// The same point's distance from the true surface, taken as a plane behind the pixel, in metres; positive
+    /// behind it.
+    pub fn error_normal_m(&self, x: usize, y: usize, depth_m: f32) -> f64 {
+        self.error_along_ray_m(x, y, depth_m) * f64::from(self.cosine_left.row(y)[x])
     }
 }
