@@ -32,6 +32,9 @@ fn refinement_and_more_frames_bring_accuracy() {
     exact.depth_m = case.truth().depth_m.clone();
     let perfect = stspp::accuracy::score::score(&exact, case.truth());
     assert_eq!((perfect.completeness, perfect.outliers, perfect.surface_rms_mm), (1.0, 0.0, 0.0));
+    assert_eq!(perfect.normal_rms_mm, 0.0);
+    // The sphere's limb and the wall seen askew: nearer to the surface than along the ray.
+    assert!(many.score.normal_rms_mm < many.score.surface_rms_mm, "{many:?}");
     // Errors are seen, wherever they are.
     let (x, y) = (exact.depth_m.width() / 2, exact.depth_m.height() / 2);
     exact.depth_m.set(x, y, 0.5);

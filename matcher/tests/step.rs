@@ -3,6 +3,7 @@
 
 use stspp_matcher::{
     DisparityRange, Image, Level, Matcher, Method, Params, ShapeFunction, StereoStack,
+    dense::{DenseMaps, mark_steps, settle::Settle},
     step::{FRAMES_MIN, StepJudge, Verdict},
     synthetic::{Layer, Rendered, Scene},
 };
@@ -170,4 +171,78 @@ fn the_fast_path_settles_its_steps() {
     assert!(settled[2] * 100 >= plain[2] * 98, "{plain:?} to {settled:?}");
     let bits = |map: &Image<f32>| map.as_slice().iter().map(|d| d.to_bits()).collect::<Vec<_>>();
     assert_eq!(bits(&one), bits(&matched(true, 3)));
+}
+
+/// A window near a step that gave its pixels a disparity which is off by less than a step: no neighbour
+/// tells, only their own grey values.
+#[test]
+fn a_point_near_a_step_that_its_own_grey_values_do_not_show_is_taken_away() {
+    let truth = scene(10);
+    let (width, height) = (truth.truth_px.width(), truth.truth_px.height());
+    let spoilt = |x: usize, y: usize| {
+        let (dx, dy) = (x as f64 - CENTRE.0, y as f64 - CENTRE.1);
+        dx < 0.0 && dy.abs() < 10.0 && (RADIUS - 5.0..RADIUS - 1.0).contains(&dx.hypot(dy))
+    };
+    let mut start = wrong(&truth, 0.0);
+    let mut maps = DenseMaps::new(width, height);
+    maps.zncc.as_mut_slice().fill(0.995);
+    for y in 0..height {
+        for x in 0..width {
+            // Twice that in two rings: a slope, which is no step either.
+            let rho = (x as f64 - CENTRE.0).hypot(y as f64 - CENTRE.1);
+            let off = if rho > RADIUS - 3.0 { 2.8 } else { 1.4 };
+            start.row_mut(y)[x] += if spoilt(x, y) { off } else { 0.0 };
+        }
+    }
+    (maps.first_px, maps.second_px) = (start.clone(), start.clone());
+    let mut step = Image::new(width, height, 0);
+    mark_steps(Level::Scalar, &start, 4, 1.5, &mut step);
+    truth.with_stack(|stack| {
+        Settle::new(Level::Scalar).run(stack, (0.9, true), &step, &mut start, &mut maps);
+    });
+    let (mut bad, mut left, mut good, mut kept) = (0, 0, 0, 0);
+    for y in 0..height {
+        for x in 0..width {
+            let rho = (x as f64 - CENTRE.0).hypot(y as f64 - CENTRE.1);
+            let d = maps.second_px.row(y)[x];
+            assert_eq!(d.is_nan(), maps.first_px.row(y)[x].is_nan());
+            if spoilt(x, y) {
+                (bad, left) = (bad + 1, left + usize::from((d - NEAR_PX).abs() > 1.0));
+            } else if rho < RADIUS - 1.0 {
+                (good, kept) = (good + 1, kept + usize::from(d == NEAR_PX));
+            }
+        }
+    }
+    println!("{left} of {bad} wrong ones left, {kept} of {good} right ones kept");
+    assert!(bad > 50 && left * 4 <= bad, "{left} of {bad}");
+    assert!(kept * 100 >= good * 99, "{kept} of {good}");
+}
+
+/// Noise takes similarity from right points too.
+#[test]
+fn weak_light_costs_no_points_near_steps() {
+    let disc = |x: f64, y: f64| (x - CENTRE.0).hypot(y - CENTRE.1) < RADIUS;
+    let layers =
+        vec![Layer::everywhere(|_, _| FAR_PX as f64), Layer::patch(|_, _| NEAR_PX as f64, disc)];
+    let mut scene = Scene::new(220, 120, 10, layers);
+    scene.peak_dn = 5.0;
+    let truth = scene.render();
+    let matched = |settle_steps: bool| {
+        let mut params = Params::new(DisparityRange { min_px: -10, max_px: 60 });
+        (params.method, params.shape) = (Method::Dense, ShapeFunction::Auto);
+        params.zncc_min = 0.5;
+        params.advanced.settle_steps = settle_steps;
+        let mut matcher = Matcher::new(params).unwrap();
+        truth.with_stack(|stack| {
+            let matched = matcher.match_stack(stack).unwrap();
+            let mut zncc: Vec<f32> = matched.zncc.as_slice().to_vec();
+            zncc.retain(|z| !z.is_nan());
+            zncc.sort_by(f32::total_cmp);
+            (count(&truth, &matched.disparity_px), zncc[zncc.len() / 2])
+        })
+    };
+    let ((plain, zncc), (settled, _)) = (matched(false), matched(true));
+    println!("ZNCC {zncc}; wrong, missing, right: {plain:?}, settled {settled:?}");
+    assert!(zncc < 0.97, "{zncc}");
+    assert!(settled[2] * 100 >= plain[2] * 98, "{plain:?} to {settled:?}");
 }

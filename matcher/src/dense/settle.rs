@@ -131,6 +131,7 @@ impl Settle {
         });
     }
 
+    /// The least similarity that a single pixel needs, by the noise of the whole image.
     fn own_similarity_min(&mut self, zncc: &Image<f32>) -> f32 {
         let known = zncc.as_slice().iter().step_by(SAMPLE).filter(|z| !z.is_nan());
         self.losses.clear();
