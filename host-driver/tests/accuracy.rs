@@ -1,8 +1,8 @@
 //! The accuracy tables on a small simulated sensor: what they say must follow from the physics.
 #![cfg(feature = "sim")]
 
-use stspp::accuracy::maps;
 use stspp::accuracy::tables::{Case, Setting, to_text};
+use stspp::accuracy::{bound, maps};
 use stspp_hil_sim::world::{SceneSpec, SensorModel};
 use stspp_matcher::Method;
 
@@ -47,4 +47,22 @@ fn refinement_and_more_frames_bring_accuracy() {
     let mut picture = Vec::new();
     maps::write_error_png(&mut picture, &exact, case.truth(), 0.1).unwrap();
     assert!(picture.starts_with(b"\x89PNG"));
+}
+
+/// On a plane nothing is lost: a fit that is told the truth is as good as the matcher's, whose kernels
+/// smooth a little, and a window of nine times fewer pixels three times worse.
+#[test]
+fn windows_told_the_truth_do_as_well_on_a_plane_as_the_matcher() {
+    let case = case("plane", &[("distance_m", "1")], 6);
+    let dense = Setting { method: Method::Dense, ..Setting::default() };
+    let dense = Setting { shape: stspp_matcher::ShapeFunction::First, ..dense };
+    let (_, frame) = case.line("plane 1 m", 6, dense).unwrap();
+    let classes = bound::bound(case.stack(), 6, &frame, case.truth());
+    println!("{}", bound::to_text(&classes));
+    let far = &classes[4];
+    assert!(far.points > 10_000 && classes[5].points >= far.points);
+    let [first, second, .., small] = far.window_normal_rms_mm;
+    assert!((0.95..1.3).contains(&(first / far.frame_normal_rms_mm)), "{far:?}");
+    assert!((1.5..2.3).contains(&(second / first)), "{far:?}");
+    assert!((2.2..4.0).contains(&(small / first)), "{far:?}");
 }

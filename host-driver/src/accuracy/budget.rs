@@ -150,7 +150,7 @@ pub(super) fn step_distances(frame: &DepthFrame, truth: &CanvasTruth) -> Image<u
 }
 
 /// The true disparity of every pixel; NaN where there is nothing.
-fn true_disparity_px(frame: &DepthFrame, truth: &CanvasTruth) -> Image<f32> {
+pub(super) fn true_disparity_px(frame: &DepthFrame, truth: &CanvasTruth) -> Image<f32> {
     let geometry = &frame.geometry;
     let (width, height) = (truth.distance_m.width(), truth.distance_m.height());
     let mut disparity = Image::new(width, height, f32::NAN);

@@ -1,6 +1,7 @@
 //! Accuracy on the simulated sensor: recordings of known scenes, reconstructed and compared with the
 //! truth behind every pixel.
 
+pub mod bound;
 pub mod budget;
 pub mod capture;
 pub mod circles;

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use serde_json::json;
+use stspp::accuracy::bound;
 use stspp::accuracy::budget::{self, Class};
 use stspp::accuracy::maps;
 use stspp::accuracy::tables::{self, AccuracyError, Case, Line, Setting};
@@ -32,6 +33,10 @@ pub struct Args {
     /// curvature and incidence.
     #[arg(long)]
     budget: bool,
+    /// Also print how near fits of windows come that are told the truth, a sample of the pixels by distance
+    /// from true steps: what noise, blur and windows cost by themselves. Takes seconds a line.
+    #[arg(long)]
+    bound: bool,
     #[command(flatten)]
     matching: Matching,
 }
@@ -60,6 +65,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let spinner = output.spinner();
     let mut lines: Vec<Line> = Vec::new();
     let mut budgets: Vec<(String, Vec<Class>)> = Vec::new();
+    let mut bounds: Vec<(String, Vec<bound::Class>)> = Vec::new();
     let mut folder = match &args.maps {
         Some(path) => Some(OutputFolder::create(path, true).map_err(|e| output_failure(&e))?),
         None => None,
@@ -75,9 +81,13 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
                 .file(&file, |out| maps::write_error_png(out, &frame, truth, 0.1))
                 .map_err(|e| output_failure(&e))?;
         }
+        let title = format!("{name}, {frames} frames, {}", line.method);
         if args.budget {
-            let title = format!("{name}, {frames} frames, {}", line.method);
-            budgets.push((title, budget::budget(&frame, truth)));
+            budgets.push((title.clone(), budget::budget(&frame, truth)));
+        }
+        if args.bound {
+            spinner.set_message(format!("{name}: windows that are told the truth"));
+            bounds.push((title, bound::bound(case.stack(), frames, &frame, truth)));
         }
         lines.push(line);
         Ok::<(), Failure>(())
@@ -137,11 +147,18 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     for (title, classes) in &budgets {
         text += &format!("\n{title}\n{}", budget::to_text(classes));
     }
+    for (title, classes) in &bounds {
+        text += &format!("\n{title}: RMS from the surface in mm\n{}", bound::to_text(classes));
+    }
     let budgets: Vec<_> = budgets
         .iter()
         .map(|(title, classes)| json!({ "line": title, "classes": classes }))
         .collect();
-    let json = json!({ "seed": args.seed, "lines": lines, "budgets": budgets });
+    let bounds: Vec<_> = bounds
+        .iter()
+        .map(|(title, classes)| json!({ "line": title, "windows": bound::WINDOWS, "classes": classes }))
+        .collect();
+    let json = json!({ "seed": args.seed, "lines": lines, "budgets": budgets, "bounds": bounds });
     output.result(&text, &json);
     Ok(())
 }
