@@ -200,6 +200,10 @@ fn inverse_first<V: Lanes, const R: usize>(
     }
 }
 
+/// Moments of a chunk's pixels up to the fourth power, a row each.
+#[repr(align(64))]
+struct Moments([[f32; CHUNK]; 15]);
+
 #[inline(always)]
 fn inverse_both<V: Lanes, const R: usize>(
     s: &[&[f32]],
@@ -210,10 +214,13 @@ fn inverse_both<V: Lanes, const R: usize>(
 ) {
     let (to_first, to_second) = rows.split_at_mut(FIRST);
     let mut columns = Columns::<5>::new();
+    let mut all = Moments([[0.0; CHUNK]; 15]);
     for at in (PAD..PAD + len).step_by(CHUNK) {
         let count = CHUNK.min(PAD + len - at);
         // SAFETY: checked by `inverse_rows`.
         unsafe { columns.fill::<V, R>(s, radius, powers, at, count) };
+        // Moments and solutions in loops of their own: together they are longer than a processor looks
+        // ahead, and a solution is a chain of operations that wait for each other.
         for i in (0..count).step_by(V::COUNT) {
             // SAFETY: as above. Powers of x at y^0 to y^4.
             let (y0, y1, y2, y3, y4) = unsafe {
@@ -225,13 +232,26 @@ fn inverse_both<V: Lanes, const R: usize>(
                     columns.across::<V, 1, R>(4, radius, powers, i),
                 )
             };
+            let to = all.0.as_mut_ptr().cast::<f32>();
+            // SAFETY: `i + COUNT` is at most CHUNK.
+            unsafe {
+                each!(K in 0 1 2 3 4 => { y0[K].store(to.add(K * CHUNK + i)); });
+                each!(K in 0 1 2 3 => { y1[K].store(to.add((5 + K) * CHUNK + i)); });
+                each!(K in 0 1 2 => { y2[K].store(to.add((9 + K) * CHUNK + i)); });
+                each!(K in 0 1 => { y3[K].store(to.add((12 + K) * CHUNK + i)); });
+                y4[0].store(to.add(14 * CHUNK + i));
+            }
+        }
+        for i in (0..count).step_by(V::COUNT) {
+            // SAFETY: as above.
+            let m = |k: usize| unsafe { V::load(all.0[k].as_ptr().add(i)) };
             let z = V::splat(0.0);
             let moments = [
-                [y0[0], y1[0], y2[0], y3[0], y4[0]],
-                [y0[1], y1[1], y2[1], y3[1], z],
-                [y0[2], y1[2], y2[2], z, z],
-                [y0[3], y1[3], z, z, z],
-                [y0[4], z, z, z, z],
+                [m(0), m(5), m(9), m(12), m(14)],
+                [m(1), m(6), m(10), m(13), z],
+                [m(2), m(7), m(11), z, z],
+                [m(3), m(8), z, z, z],
+                [m(4), z, z, z, z],
             ];
             for (row, v) in to_first.iter_mut().zip(inverse_row(first_matrix(&moments))) {
                 // SAFETY: as above.
