@@ -22,7 +22,7 @@ use super::{
 };
 use crate::{
     Image, Level,
-    lanes::{WIDEST, vectorised},
+    lanes::{Lanes, WIDEST, dispatch, vectorised},
     parallel::PerThread,
 };
 
@@ -210,15 +210,40 @@ impl Buffers {
             box_sum(level, &around, WIDE, len, (&mut self.column, &mut self.threes), sum);
         }
         let sums = self.sums.each_ref().map(|sum| &sum[PAD..PAD + out.len()]);
-        let blend = Blend { first, second, sums, sigma, zncc_min };
-        vectorised!(
+        blend_row(level, &Blend { first, second, sums, sigma, zncc_min }, zncc, out);
+    }
+}
+
+/// Writes a row's disparities, and its ZNCC where there is one, NaN elsewhere.
+fn blend_row(level: Level, blend: &Blend<'_>, zncc: &mut [f32], out: &mut [f32]) {
+    let whole = out.len() / WIDEST * WIDEST;
+    let ([first, second], sums) = ([blend.first, blend.second], blend.sums);
+    assert!(first.len() == out.len() && second.len() == out.len() && zncc.len() == out.len());
+    assert!(sums.iter().all(|sum| sum.len() == out.len()));
+    let vectors = |blend: &Blend<'_>, zncc: &mut [f32], out: &mut [f32]| {
+        dispatch!(
             level,
-            blend_loop(
-                blend: &Blend<'_> = &blend,
+            blend_lanes(
+                blend: &Blend<'_> = blend,
                 zncc: &mut [f32] = zncc,
                 out: &mut [f32] = out,
             )
         );
+    };
+    vectors(blend, &mut zncc[..whole], &mut out[..whole]);
+    let left = out.len() - whole;
+    if left > 0 {
+        // The last pixels, fewer than a vector, in one of their own.
+        let mut last = [[0.0f32; WIDEST]; 9];
+        let from = [first, second, &*zncc].into_iter().chain(sums);
+        for (to, row) in last.iter_mut().zip(from) {
+            to[..left].copy_from_slice(&row[whole..]);
+        }
+        let [first, second, z, a, b, c, d, e, to] = &mut last;
+        let sums = [&a[..], &b[..], &c[..], &d[..], &e[..]];
+        vectors(&Blend { first, second, sums, ..*blend }, z, to);
+        zncc[whole..].copy_from_slice(&z[..left]);
+        out[whole..].copy_from_slice(&to[..left]);
     }
 }
 
@@ -249,38 +274,53 @@ fn enter_loop(first: &[f32], second: &[f32], rows: [&mut [f32]; 4], columns: [&m
 
 /// 0 up to the lower bound, 1 from the upper one.
 #[inline(always)]
-fn ramp(value: f32, (low, high): (f32, f32)) -> f32 {
-    ((value - low) * (1.0 / (high - low))).clamp(0.0, 1.0)
+fn ramp<V: Lanes>(value: V, (low, high): (f32, f32)) -> V {
+    let (zero, one) = (V::splat(0.0), V::splat(1.0));
+    let part = value.sub(V::splat(low)).mul(V::splat(1.0 / (high - low)));
+    let part = V::select(zero.lt(part), part, zero);
+    V::select(part.lt(one), part, one)
 }
 
+/// Whole vectors of a row: as many pixels as `out` holds.
 #[inline(always)]
-fn blend_loop(blend: &Blend<'_>, zncc: &mut [f32], out: &mut [f32]) {
+fn blend_lanes<V: Lanes>(blend: &Blend<'_>, zncc: &mut [f32], out: &mut [f32]) {
     let n = out.len();
-    let (first, second) = (&blend.first[..n], &blend.second[..n]);
-    let [sum, squares, count, near, kept] = blend.sums.map(|sum| &sum[..n]);
-    let zncc = &mut zncc[..n];
+    assert!(n.is_multiple_of(V::COUNT) && zncc.len() >= n);
+    assert!([blend.first, blend.second].iter().chain(&blend.sums).all(|row| row.len() >= n));
+    let [one, nan] = [1.0, f32::NAN].map(V::splat);
+    let known = |v: V| v.abs().lt(V::splat(f32::INFINITY));
+    let per_sigma_at_one = V::splat(1.0 / blend.sigma);
     let all_near = ((2 * WIDE + 1) * (2 * WIDE + 1)) as f32;
-    for i in 0..n {
-        let (a, b, z) = (first[i], second[i], zncc[i]);
-        let sigma = blend.sigma * (1.0 - z).max(LOSS_MIN).sqrt();
-        let per_sigma = 1.0 / sigma;
-        let per = 1.0 / count[i].max(1.0);
-        let mean = sum[i] * per;
-        let variance = (squares[i] * per - mean * mean) * per_sigma * per_sigma;
-        let bias = mean * ramp(mean.abs() * per_sigma, BIAS);
-        let calm = a + bias;
-        let wide = kept[i] * (1.0 / all_near) + (1.0 + WIDE_BIAS) * bias;
-        let change = wide - calm;
-        let part = 1.0 - ramp(change.abs() * per_sigma, SHAPE);
-        let calm = if near[i] > all_near - 0.5 { calm + part * change } else { calm };
-        let whole = calm + ramp(variance, ROUGH) * (b - calm);
-        let edge = a + ramp(mean.abs() * per_sigma, EDGE) * (b - a);
-        let both = if count[i] >= WHOLE { whole } else { edge };
+    for i in (0..n).step_by(V::COUNT) {
+        // SAFETY: `i + COUNT <= n`.
+        let load = |row: &[f32]| unsafe { V::load(row.as_ptr().add(i)) };
+        let (a, b, z) = (load(blend.first), load(blend.second), load(zncc));
+        let [sum, squares, count, near, kept] = blend.sums.map(load);
+        let loss = one.sub(z);
+        let loss = V::select(V::splat(LOSS_MIN).lt(loss), loss, V::splat(LOSS_MIN));
+        let per_sigma = loss.reciprocal_sqrt().mul(per_sigma_at_one);
+        let per = V::select(one.lt(count), count, one).reciprocal();
+        let mean = sum.mul(per);
+        let variance = mean.neg_mul_add(mean, squares.mul(per)).mul(per_sigma).mul(per_sigma);
+        let size = mean.abs().mul(per_sigma);
+        let bias = mean.mul(ramp(size, BIAS));
+        let calm = a.add(bias);
+        let wide = V::splat(1.0 + WIDE_BIAS).mul_add(bias, kept.mul(V::splat(1.0 / all_near)));
+        let change = wide.sub(calm);
+        let part = one.sub(ramp(change.abs().mul(per_sigma), SHAPE));
+        let calm = V::select(V::splat(all_near - 0.5).lt(near), part.mul_add(change, calm), calm);
+        let whole = ramp(variance, ROUGH).mul_add(b.sub(calm), calm);
+        let edge = ramp(size, EDGE).mul_add(b.sub(a), a);
+        let both = V::select(count.lt(V::splat(WHOLE)), edge, whole);
         // Where only the first order could be fitted it has to do.
-        let d = if b.is_nan() { a } else { both };
-        let good = z >= blend.zncc_min && !d.is_nan();
-        out[i] = if good { d } else { f32::NAN };
-        zncc[i] = if good { z } else { f32::NAN };
+        let d = V::select(known(b), both, a);
+        let good = V::both(known(z), known(d));
+        let good = V::select(z.lt(V::splat(blend.zncc_min)), nan, V::select(good, d, nan));
+        // SAFETY: as above.
+        unsafe {
+            good.store(out.as_mut_ptr().add(i));
+            V::select(known(good), z, nan).store(zncc.as_mut_ptr().add(i));
+        }
     }
 }
 
