@@ -13,6 +13,7 @@
 //! All windows share one warp and separable sums. phi is 1, x, y or 1, x, y, x^2, xy, y^2.
 
 pub(crate) mod gradient;
+pub(crate) mod job;
 pub mod kernels;
 pub(crate) mod moments;
 pub mod motion;
@@ -29,17 +30,15 @@ pub(crate) mod warp;
 use rayon::prelude::*;
 
 use crate::{Image, Level, Sample, ShapeFunction, StereoStack, parallel::PerThread};
+use job::{BAND, Job, Output, columns, origin};
 use motion::{BLOCK, Motion, along::Watch, sums::Blocks};
 use solve::Fits;
 pub use steps::mark_steps;
-use tile::{Job, Output, Tile};
+use tile::Tile;
 
 /// Columns a tile fits. Narrower strips would keep a tile's rows in a core's second-level cache, but cost
 /// more than that saves: memory gives short pieces of twenty images' rows slowly.
 const STRIP: usize = 2048;
-/// Fewest rows of a task: each that does not follow its thread's last one computes some rows beyond its
-/// own anew.
-const BAND: usize = 64;
 /// Tasks of a thread: they let others take over what a busy core leaves.
 const TASKS: usize = 4;
 
@@ -222,31 +221,4 @@ impl DenseFit {
                 });
             });
     }
-}
-
-/// Ranges of columns of a band that are to be fitted: all, or those of the blocks set in `again`.
-fn columns(width: usize, band: usize, again: Option<&Image<bool>>) -> Vec<(usize, usize)> {
-    let Some(again) = again else { return vec![(0, width)] };
-    let per_band = BAND / BLOCK;
-    let rows = band * per_band..((band + 1) * per_band).min(again.height());
-    let set = |column: usize| rows.clone().any(|row| again.row(row)[column]);
-    let mut ranges: Vec<(usize, usize)> = Vec::new();
-    for column in (0..again.width()).filter(|&c| set(c)) {
-        let (from, to) = (column * BLOCK, ((column + 1) * BLOCK).min(width));
-        match ranges.last_mut() {
-            Some(last) if last.1 == from => last.1 = to,
-            _ => ranges.push((from, to)),
-        }
-    }
-    ranges
-}
-
-/// A whole number near the mean disparity, subtracted inside for precision.
-fn origin(start: &Image<f32>) -> f32 {
-    let (mut sum, mut n) = (0.0f64, 0u32);
-    for &v in start.as_slice().iter().step_by(61).filter(|v| v.is_finite()) {
-        sum += f64::from(v);
-        n += 1;
-    }
-    if n == 0 { 0.0 } else { (sum / f64::from(n)).round() as f32 }
 }

@@ -11,10 +11,11 @@
 
 use super::{
     gradient::{Static, static_row},
+    job::{Job, Output, image_rows},
     moments::{PAD, Powers, powers, slide_sum},
     motion::{
-        BLOCK, Motion,
-        along::{Along, Found, Watch},
+        BLOCK,
+        along::{Along, Found},
         sums::Block,
     },
     normalise::{
@@ -25,53 +26,7 @@ use super::{
     solve::{FIRST, Fits, SECOND, disparities, inverse_rows},
     warp::{Source, Warped, moving, warp_row},
 };
-use crate::{Image, Level, Sample, aligned::Aligned, lanes::vectorised};
-
-/// What all tiles of a frame share.
-pub(crate) struct Job<'a> {
-    pub level: Level,
-    /// Another one for each frame.
-    pub stamp: u64,
-    /// Left images, an even number.
-    pub left: &'a [&'a Image<Sample>],
-    /// Right images, likewise.
-    pub right: &'a [&'a Image<Sample>],
-    /// Number of frames that are not padding.
-    pub frames: usize,
-    /// Starting disparities; NaN is invalid.
-    pub start: &'a Image<f32>,
-    /// Non-zero where a window holds a depth step.
-    pub step: &'a Image<u8>,
-    pub radius: usize,
-    pub fits: Fits,
-    /// Largest difference of a window pixel from the centre at steps.
-    pub surface_px: f32,
-    /// Subtracted from disparities for precision.
-    pub origin: f32,
-    /// Each frame's own place, where the surface moves.
-    pub motion: Option<&'a Motion>,
-    /// Where motion is looked for.
-    pub watch: Option<Watch>,
-}
-
-impl Job<'_> {
-    /// What to look for motion with in row `y`, if that row is looked at.
-    fn watch_at(&self, y: isize) -> Option<&Watch> {
-        let inside = (0..self.start.height() as isize).contains(&y);
-        self.watch.as_ref().filter(|_| inside && Watch::samples(y))
-    }
-}
-
-/// The rows a tile writes: full image rows, of which it fills the columns it was asked for.
-pub(crate) struct Output<'a> {
-    pub first: &'a mut [f32],
-    pub second: &'a mut [f32],
-    pub zncc: &'a mut [f32],
-    /// Mean of the left images' grey values, where it is wanted.
-    pub brightness: Option<&'a mut [u8]>,
-    /// Blocks of motion, of all columns.
-    pub blocks: &'a mut [Block],
-}
+use crate::{Level, aligned::Aligned, lanes::vectorised};
 
 /// Buffers of a tile, kept between tiles.
 #[derive(Debug, Default)]
@@ -532,9 +487,4 @@ fn warp(
         None => warp_row(level, source, out),
         Some(motion) => moving::warp_moving_row(level, source, &motion, scratch, out),
     }
-}
-
-/// Row `y` of each image.
-pub(crate) fn image_rows<'a>(images: &[&'a Image<Sample>], y: isize) -> [&'a [Sample]; 16] {
-    std::array::from_fn(|i| images.get(i).map_or(&[][..], |image| image.row(y as usize)))
 }

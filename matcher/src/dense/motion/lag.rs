@@ -6,8 +6,8 @@
 
 use super::{BLOCK, Motion, sums::Frame};
 use crate::{
+    dense::job::image_rows,
     dense::moments::{PAD, box_sum},
-    dense::tile::image_rows,
     lanes::vectorised,
     params::RADIUS_LIMIT,
 };

@@ -13,7 +13,7 @@ use crate::{
     Image, Level, Sample, StereoStack,
     dense::{
         gradient::{SQUARE_UNIT, Static, static_row},
-        tile::image_rows,
+        job::image_rows,
         warp::{Source, Warped, moving, warp_row},
     },
     lanes::vectorised,
