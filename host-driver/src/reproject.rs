@@ -1,10 +1,14 @@
 //! From disparities to depth and points.
 
-use std::sync::Arc;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+mod plain;
+
+use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Matrix3, Point3};
 use rayon::prelude::*;
-use stspp_matcher::{Image, Matched, SAMPLES_PER_DN8, Sample};
+use stspp_matcher::{Image, Level, Matched, SAMPLES_PER_DN8, Sample};
 
 use crate::{DepthFrame, PointCloud, RectifiedGeometry, SlotLabel};
 
@@ -59,12 +63,13 @@ impl Reprojection {
 }
 
 impl Row {
-    /// Component `k` of the points of a row; NaN without a disparity or behind the cameras.
-    fn component(&self, k: usize, disparity_px: &[f32], out: &mut [f32]) {
+    /// Component `k` of the points of pixels from column `from` on; NaN without a disparity or behind the
+    /// cameras.
+    fn component(&self, k: usize, from: usize, disparity_px: &[f32], out: &mut [f32]) {
         let (first, step) = (self.first[k], self.step[k]);
-        for (x, (out, &d)) in out.iter_mut().zip(disparity_px).enumerate() {
+        for (i, (out, &d)) in out.iter_mut().zip(disparity_px).enumerate() {
             let parallax_px = d - self.disparity_at_infinity_px;
-            let value = (first + step * x as i32 as f32) / parallax_px;
+            let value = (first + step * (from + i) as i32 as f32) * (1.0 / parallax_px);
             *out = if parallax_px > 0.0 { value } else { f32::NAN };
         }
     }
@@ -78,18 +83,58 @@ pub fn depth_of_disparity(geometry: &RectifiedGeometry, disparity_px: &Image<f32
     bands.for_each(|(band, rows)| {
         for (k, out) in rows.chunks_mut(width).enumerate() {
             let y = band * BAND + k;
-            reprojection.row(y).component(2, disparity_px.row(y), out);
+            reprojection.row(y).component(2, 0, disparity_px.row(y), out);
         }
     });
     depth_m
 }
 
-/// Pixels that are compacted at a time.
-const RUN: usize = 256;
+/// What points are made of besides a row's disparities, as many of each.
+struct Sources<'a> {
+    disparity_px: &'a [f32],
+    zncc: &'a [f32],
+    intensity: &'a [u8],
+    rate: Option<&'a [f32]>,
+}
+
+/// The part of a cloud that a task fills; no rates without a map of them.
+struct Part<'a> {
+    points: &'a mut [Point3<f32>],
+    zncc: &'a mut [f32],
+    intensity: &'a mut [u8],
+    rate: &'a mut [f32],
+}
+
+/// The level of the kernels; what the environment asks for in vain is the matcher's to report.
+fn level() -> Level {
+    static LEVEL: OnceLock<Level> = OnceLock::new();
+    *LEVEL.get_or_init(|| Level::choose(None).unwrap_or_else(|_| Level::best()))
+}
+
+/// Writes the valid points of a row to `part` from place `at` on; returns the place after them.
+///
+/// # Panics
+/// When they are more than there is place for.
+fn pack_row(level: Level, row: &Row, from: &Sources<'_>, part: &mut Part<'_>, at: usize) -> usize {
+    let n = from.disparity_px.len();
+    assert!(from.zncc.len() == n && from.intensity.len() == n);
+    assert!(from.rate.is_none_or(|rate| rate.len() == n && part.rate.len() == part.points.len()));
+    assert!(part.zncc.len() == part.points.len() && part.intensity.len() == part.points.len());
+    match level {
+        // SAFETY: the level is this processor's; lengths are as checked.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => unsafe { avx512::pack_row(row, from, part, at) },
+        _ => plain::pack_row(row, from, part, at),
+    }
+}
 
 /// All valid pixels of a frame as points of the left camera's frame, row by row, in place of what
 /// `cloud` holds.
 pub(crate) fn point_cloud(frame: &DepthFrame, cloud: &mut PointCloud) {
+    point_cloud_at(level(), frame, cloud);
+}
+
+fn point_cloud_at(level: Level, frame: &DepthFrame, cloud: &mut PointCloud) {
     let disparity_px = &frame.disparity_px;
     let (width, height) = (disparity_px.width(), disparity_px.height());
     let reprojection = Reprojection::new(&frame.geometry);
@@ -111,40 +156,24 @@ pub(crate) fn point_cloud(frame: &DepthFrame, cloud: &mut PointCloud) {
     let mut rates = &mut cloud.depth_rate_m_per_s[..];
     let mut parts = Vec::with_capacity(counts.len());
     for count in counts {
-        parts.push((
-            points.split_off_mut(..count).unwrap_or_default(),
-            znccs.split_off_mut(..count).unwrap_or_default(),
-            greys.split_off_mut(..count).unwrap_or_default(),
+        parts.push(Part {
+            points: points.split_off_mut(..count).unwrap_or_default(),
+            zncc: znccs.split_off_mut(..count).unwrap_or_default(),
+            intensity: greys.split_off_mut(..count).unwrap_or_default(),
             // Empty without rates.
-            rates.split_off_mut(..count).unwrap_or_default(),
-        ));
+            rate: rates.split_off_mut(..count).unwrap_or_default(),
+        });
     }
-    parts.into_par_iter().enumerate().for_each(|(band, (points, znccs, greys, rates))| {
+    parts.into_par_iter().enumerate().for_each(|(band, mut part)| {
         let mut at = 0;
-        let mut xyz = [[0.0_f32; RUN]; 3];
         for y in band * BAND..((band + 1) * BAND).min(height) {
-            let mut row = reprojection.row(y);
-            let runs = disparity_px.row(y).chunks(RUN);
-            let others = frame.zncc.row(y).chunks(RUN).zip(frame.intensity.row(y).chunks(RUN));
-            for (run, (disparities, (zncc, intensity))) in runs.zip(others).enumerate() {
-                let rate = rate_map.map(|map| &map.row(y)[run * RUN..]);
-                for (k, out) in xyz.iter_mut().enumerate() {
-                    row.component(k, disparities, out);
-                    row.first[k] += row.step[k] * RUN as f32;
-                }
-                for (i, (&zncc, &grey)) in zncc.iter().zip(intensity).enumerate() {
-                    let [x, y, z] = [xyz[0][i], xyz[1][i], xyz[2][i]];
-                    if !z.is_nan() {
-                        points[at] = Point3::new(x, y, z);
-                        znccs[at] = zncc;
-                        greys[at] = grey;
-                        if let Some(rate) = rate {
-                            rates[at] = rate[i];
-                        }
-                        at += 1;
-                    }
-                }
-            }
+            let from = Sources {
+                disparity_px: disparity_px.row(y),
+                zncc: frame.zncc.row(y),
+                intensity: frame.intensity.row(y),
+                rate: rate_map.map(|map| map.row(y)),
+            };
+            at = pack_row(level, &reprojection.row(y), &from, &mut part, at);
         }
     });
 }
@@ -154,6 +183,9 @@ pub(crate) fn point_cloud(frame: &DepthFrame, cloud: &mut PointCloud) {
 pub fn brightness(matched: &mut Matched, left: &[&Image<Sample>]) -> Image<u8> {
     matched.brightness.take().unwrap_or_else(|| mean_intensity(left))
 }
+
+/// Pixels whose mean is taken at a time.
+const RUN: usize = 256;
 
 /// Brightness of the left camera over a window: the mean of its rectified frames.
 pub fn mean_intensity(left: &[&Image<Sample>]) -> Image<u8> {
@@ -218,5 +250,68 @@ pub fn depth_frame(
         arrived: None,
         geometry: Arc::clone(geometry),
         stages: matched.stages,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_level_packs_the_same_points_as_one_by_one() {
+        for (width, height) in [(1_usize, 1_usize), (15, 3), (16, 40), (37, 70), (300, 65)] {
+            let mut state = 7_u64;
+            let mut random = || {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(9);
+                (state >> 40) as f32 / (1 << 24) as f32
+            };
+            let row = Row {
+                first: [-0.4, 0.3, 1.1],
+                step: [0.001, -0.000_02, 0.000_1],
+                disparity_at_infinity_px: -20.0,
+            };
+            // Some behind the cameras, some without a disparity, and runs of both.
+            let mut disparity_px = Image::new(width, height, f32::NAN);
+            let mut mean = 0.9;
+            for d in disparity_px.as_mut_slice() {
+                mean = if random() < 0.05 { random() } else { mean };
+                *d = if random() < mean { 150.0 * random() - 30.0 } else { f32::NAN };
+            }
+            let zncc = disparity_px.map(|_| random());
+            let intensity = disparity_px.map(|_| (256.0 * random()) as u8);
+            let rate = disparity_px.map(|_| random());
+            for rates in [None, Some(&rate)] {
+                for y in 0..height {
+                    let from = Sources {
+                        disparity_px: disparity_px.row(y),
+                        zncc: zncc.row(y),
+                        intensity: intensity.row(y),
+                        rate: rates.map(|map| map.row(y)),
+                    };
+                    let valid = |x: &usize| from.disparity_px[*x] > -20.0;
+                    let count = (0..width).filter(valid).count();
+                    for level in Level::available() {
+                        let mut points = vec![Point3::origin(); count];
+                        let (mut z, mut g) = (vec![0.0; count], vec![0; count]);
+                        let mut r = vec![0.0; if rates.is_some() { count } else { 0 }];
+                        let part = &mut Part {
+                            points: &mut points,
+                            zncc: &mut z,
+                            intensity: &mut g,
+                            rate: &mut r,
+                        };
+                        assert_eq!(pack_row(level, &row, &from, part, 0), count, "{level} {width}");
+                        for (i, x) in (0..width).filter(valid).enumerate() {
+                            let ray = |k: usize| row.first[k] + row.step[k] * x as f32;
+                            let scale = 1.0 / (from.disparity_px[x] + 20.0);
+                            let want = Point3::new(ray(0), ray(1), ray(2)) * scale;
+                            assert_eq!(points[i], want, "{level} {width} {x}");
+                            assert_eq!((z[i], g[i]), (from.zncc[x], from.intensity[x]));
+                            assert!(from.rate.is_none_or(|rate| r[i] == rate[x]));
+                        }
+                    }
+                }
+            }
+        }
     }
 }

@@ -102,7 +102,8 @@ struct Scratch {
 struct Free {
     /// Whether a match has it, with places before and after the row.
     taken: Vec<u8>,
-    /// Their descriptors and columns, side by side.
+    /// How many are free; their descriptors and columns, side by side.
+    count: usize,
     descriptors: Vec<u64>,
     columns: Vec<u16>,
 }
@@ -358,14 +359,15 @@ impl Free {
         shared::take(scene.level, disparities, costs, TAKEN_COST, &mut self.taken);
         let taken = &self.taken[shared::BLOCK..][..width];
         let row = &scene.right.row(y)[MARGIN..][..width];
-        untaken(scene.level, taken, row, &mut self.descriptors, &mut self.columns);
+        self.count = untaken(scene.level, taken, row, &mut self.descriptors, &mut self.columns);
     }
 
     /// The whole range for pixel `x`; `None` where nothing matches well.
     fn search(&self, scene: &Scene<'_>, x: usize, value: u64) -> Option<i32> {
         let place = |d: i32| x as i64 - i64::from(d);
-        let from = self.columns.partition_point(|c| i64::from(*c) < place(scene.range.max_px));
-        let to = self.columns.partition_point(|c| i64::from(*c) <= place(scene.range.min_px));
+        let columns = &self.columns[..self.count];
+        let from = columns.partition_point(|c| i64::from(*c) < place(scene.range.max_px));
+        let to = columns.partition_point(|c| i64::from(*c) <= place(scene.range.min_px));
         let (bits, at) = nearest(scene.level, value, &self.descriptors[from..to])?;
         let most = if scene.images.len() < FRAMES_MANY { FOUND_COST_FEW } else { FOUND_COST };
         (bits <= most).then(|| x as i32 - i32::from(self.columns[from + at]))

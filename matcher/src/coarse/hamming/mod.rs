@@ -104,27 +104,26 @@ pub(crate) fn nearest(level: Level, value: u64, row: &[u64]) -> Option<(u32, usi
     (!row.is_empty()).then_some(((key >> 32) as u32, key as u32 as usize))
 }
 
-/// Puts the descriptors of `row` that are not `taken`, and their columns, side by side.
+/// Puts the descriptors of `row` that are not `taken`, and their columns, side by side at the begin of
+/// `descriptors` and `columns`; returns their number.
 pub(crate) fn untaken(
     level: Level,
     taken: &[u8],
     row: &[u64],
     descriptors: &mut Vec<u64>,
     columns: &mut Vec<u16>,
-) {
+) -> usize {
     assert!(taken.len() == row.len() && row.len() <= 1 << 16);
     // Whole blocks are written, of which only the first values count.
     descriptors.resize(row.len() + BLOCK, 0);
     columns.resize(row.len() + BLOCK, 0);
     let (to, to_columns) = (&mut descriptors[..], &mut columns[..]);
-    let count = match level {
+    match level {
         // SAFETY: trusted levels are the processor's; there is a block more than the row is long.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 => unsafe { avx512::untaken(taken, row, to, to_columns) },
         _ => scalar::untaken(taken, row, to, to_columns),
-    };
-    descriptors.truncate(count);
-    columns.truncate(count);
+    }
 }
 
 #[cfg(test)]
@@ -196,8 +195,9 @@ mod tests {
                     (0..n).filter(|i| taken[*i] == 0).map(|i| (row[i], i as u16)).collect();
                 for level in Level::available() {
                     let (mut descriptors, mut columns) = (Vec::new(), Vec::new());
-                    untaken(level, &taken, &row, &mut descriptors, &mut columns);
-                    let got: Vec<(u64, u16)> = descriptors.into_iter().zip(columns).collect();
+                    let n = untaken(level, &taken, &row, &mut descriptors, &mut columns);
+                    let got: Vec<(u64, u16)> =
+                        descriptors.into_iter().zip(columns).take(n).collect();
                     assert_eq!(got, want, "{level} {n} {one_in}");
                 }
             }
