@@ -233,24 +233,23 @@ mod tests {
     #[test]
     fn the_fit_sees_the_rates_that_a_pass_of_their_own_finds() {
         let level = Level::best();
-        for (rate, frames, radius) in
-            [(0.0, 10, 4), (0.01, 10, 4), (-0.03, 7, 4), (0.02, 16, 8), (0.02, 9, 2)]
-        {
+        // Few and small: this runs under a memory checker and an emulator too.
+        for (rate, frames, radius) in [(0.0, 10, 4), (0.02, 7, 8), (-0.02, 5, 2)] {
             let plane = Layer {
                 rate_px_per_frame: rate,
                 ..Layer::everywhere(|x, y| 21.3 + 0.11 * x - 0.07 * y)
             };
-            let scene = Scene::new(231, 170, frames, vec![plane]).render();
+            let scene = Scene::new(135, 106, frames, vec![plane]).render();
             scene.with_stack(|stack| {
                 let mut coarse = Coarse::new(level, DisparityRange { min_px: -20, max_px: 60 });
-                let mut map = CoarseMap::new(231, 170);
+                let mut map = CoarseMap::new(135, 106);
                 coarse.describe(stack);
                 coarse.search(stack, true, &mut map);
                 let start =
                     map.disparity.map(|d| if d == INVALID { f32::NAN } else { f32::from(d) });
-                let mut step = Image::new(231, 170, 0);
+                let mut step = Image::new(135, 106, 0);
                 mark_steps(level, &start, radius, 1.5, &mut step);
-                let mut maps = DenseMaps::new(231, 170);
+                let mut maps = DenseMaps::new(135, 106);
                 let mut fit = DenseFit::new(level, radius, ShapeFunction::Auto, 1.5);
                 fit.fit(stack, &start, &step, &mut maps);
                 let times = Times::of(stack).unwrap();
@@ -272,8 +271,9 @@ mod tests {
                     (mean.map(|sum| sum / n), noise.map(|sum: f64| (sum / n).sqrt()));
                 println!("{rate} {frames} {radius}: {n} blocks, off {mean:.5?}, noise {noise:.5?}");
                 assert!(n >= 0.97 * apart.blocks.iter().filter(known).count() as f64);
-                assert!(noise[0] < 1.2 * noise[1], "{noise:?}");
-                assert!((mean[0] - mean[1]).abs() < 0.06 * rate.abs() + 0.0002, "{mean:?}");
+                assert!(noise[0] < 1.3 * noise[1], "{noise:?}");
+                let chance = 2.5 * noise[1] / n.sqrt();
+                assert!((mean[0] - mean[1]).abs() < 0.06 * rate.abs() + chance, "{mean:?}");
             });
         }
     }
