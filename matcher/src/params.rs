@@ -24,9 +24,9 @@ pub enum ShapeFunction {
     /// u, ux, uy: the least noise, right on surfaces that are flat within a subset.
     First,
     /// Also uxx, uyy, uxy: follows curvature.
-    #[default]
     Second,
     /// The order per pixel that fits: first where flat, second where curved.
+    #[default]
     Auto,
 }
 
@@ -37,9 +37,9 @@ pub enum Method {
     /// Parabola through the census costs (paper eq 6); no refinement.
     Parabola,
     /// Per-point inverse-compositional Gauss-Newton, as the paper does (eq 7-19).
-    #[default]
     IcGn,
     /// Dense least squares with shared warps: the same estimate in real time.
+    #[default]
     Dense,
 }
 

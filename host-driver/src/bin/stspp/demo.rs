@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use stspp::accuracy::{CanvasTruth, score};
 use stspp::export::{folder::OutputFolder, outputs};
 use stspp::measure::{plane, rms, sphere};
-use stspp::{DepthFrame, SlotLabel};
+use stspp::DepthFrame;
 use stspp_hil_sim::world::{PrimitiveShape, World};
 
 use crate::exit::{Failure, Kind};
@@ -69,9 +69,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let frame = frame.map_err(|e| failure(&e))?;
 
     progress.set_message("comparing with the truth");
-    let centres = frame.labels.iter().map(SlotLabel::exposure_centre_s);
-    let time_s = centres.sum::<f64>() / frame.labels.len().max(1) as f64;
-    let time_ns = (time_s * 1e9) as u64;
+    // What moves is compared where it was at the depth's own time.
+    let time_ns = (frame.time_device_s.unwrap_or(0.0) * 1e9) as u64;
     let matching = stream.matching().clone();
     let truth = CanvasTruth::trace(&world, &frame.geometry, &matching.left_mask, time_ns);
     let scored = score::score(&frame, &truth);

@@ -72,9 +72,9 @@ pub enum MethodName {
     /// Parabola through the census costs, no refinement.
     Parabola,
     /// Per-point Gauss-Newton, as the paper does.
-    #[default]
     Icgn,
-    /// Dense least squares with shared warps.
+    /// Dense least squares with shared warps: the same estimate in real time.
+    #[default]
     Dense,
 }
 
@@ -85,10 +85,10 @@ pub enum OrderName {
     #[value(name = "1")]
     First,
     /// Second order: follows curvature.
-    #[default]
     #[value(name = "2")]
     Second,
     /// The order that fits each pixel.
+    #[default]
     Auto,
 }
 
