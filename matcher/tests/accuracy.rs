@@ -15,6 +15,7 @@ fn plane(width: usize, height: usize, frames: usize) -> Rendered {
 
 fn solve(rendered: &Rendered, change: impl FnOnce(&mut Params)) -> Matched {
     let mut params = Params::new(DisparityRange { min_px: -30, max_px: 60 });
+    (params.method, params.shape) = (Method::IcGn, ShapeFunction::Second);
     change(&mut params);
     rendered.with_stack(|s| Matcher::new(params).unwrap().match_stack(s)).unwrap()
 }

@@ -5,7 +5,8 @@ mod synthetic;
 
 use reference::{Volume, census, check, icgn, parabola, wta};
 use stspp_matcher::{
-    DisparityRange, Image, Interpolation, Level, Params, Sample, StereoStack,
+    DisparityRange, Image, Interpolation, Level, Method, Params, Sample, ShapeFunction,
+    StereoStack,
     bspline::{self, LANES},
     census::{CensusKernel, CensusRow, PaddedStack, Side, outside_bit},
     check as fast_check,
@@ -370,7 +371,8 @@ fn masked_pixels_never_matter() {
             right_mask: Some(&right_mask),
             ..StereoStack::new(&left, &right)
         };
-        let params = Params::new(DisparityRange { min_px: -3, max_px: 16 });
+        let mut params = Params::new(DisparityRange { min_px: -3, max_px: 16 });
+        (params.method, params.shape) = (Method::IcGn, ShapeFunction::Second);
         stspp_matcher::Matcher::new(params).unwrap().match_stack(&stack).unwrap()
     };
     let a = run(&rendered.left, &rendered.right);

@@ -5,10 +5,10 @@ use std::time::Instant;
 
 use nalgebra::Point3;
 use serde_json::{Value, json};
+use stspp::DepthFrame;
 use stspp::accuracy::{CanvasTruth, score};
 use stspp::export::{folder::OutputFolder, outputs};
 use stspp::measure::{plane, rms, sphere};
-use stspp::DepthFrame;
 use stspp_hil_sim::world::{PrimitiveShape, World};
 
 use crate::exit::{Failure, Kind};
