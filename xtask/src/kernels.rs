@@ -75,7 +75,8 @@ fn count() -> Result<Option<Vec<(f64, String)>>, String> {
         return Ok(None);
     }
     let mut annotate = Command::new("callgrind_annotate");
-    annotate.arg("--threshold=100").arg(&file);
+    // Annotated sources would name each function once more, with what its calls cost.
+    annotate.args(["--auto=no", "--threshold=100"]).arg(&file);
     let text = output(annotate)?;
     let lines = text.lines().filter_map(|line| {
         let (number, rest) = line.trim_start().split_once(' ')?;
