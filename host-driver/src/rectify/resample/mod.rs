@@ -7,6 +7,8 @@ mod scalar;
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 
 use stspp_matcher::Level;
 
@@ -96,6 +98,9 @@ pub(super) fn along(
         // SAFETY: both levels include AVX2; the line reaches as far as any tap, and slices are as
         // long as checked above.
         Level::Avx2 | Level::Avx512 => unsafe { avx2::along(line, row, taps, shift, out) },
+        #[cfg(target_arch = "aarch64")]
+        // SAFETY: the level is this processor's; the rest as above.
+        Level::Neon => unsafe { neon::along(line, row, taps, shift, out) },
         _ => scalar::along(line, row, taps, shift, out),
     }
 }
@@ -121,6 +126,9 @@ pub(super) fn across(
         Level::Avx2 | Level::Avx512 => unsafe {
             avx2::across(lines, stride, row, taps, shift, out);
         },
+        #[cfg(target_arch = "aarch64")]
+        // SAFETY: the level is this processor's; the rest as above.
+        Level::Neon => unsafe { neon::across(lines, stride, row, taps, shift, out) },
         _ => scalar::across(lines, stride, row, taps, shift, out),
     }
 }

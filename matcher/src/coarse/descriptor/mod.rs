@@ -8,6 +8,8 @@ mod scalar;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 
 use rayon::prelude::*;
 
@@ -150,6 +152,9 @@ fn describe_row(level: Level, tests: &[Test; 64], codes: &Codes, y: usize, out: 
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { avx2::blocks(rows, out) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::blocks(rows, out) },
         _ => scalar::blocks(rows, out),
     }
 }

@@ -10,6 +10,8 @@ mod scalar;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 
 use crate::Level;
 
@@ -17,7 +19,7 @@ use crate::Level;
 pub(super) const BLOCK: usize = 32;
 
 /// Disparities of a block that are dealt with at once; pixels of others follow one by one.
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 const SPREAD: usize = 4;
 
 /// Where the right pixels of the left pixels from `x` on are, in a row with [`BLOCK`] places before its
@@ -38,6 +40,9 @@ pub(super) fn claim(level: Level, disparity: &[i16], cost: &[u8], claims: &mut [
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { avx2::claim(disparity, cost, claims) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::claim(disparity, cost, claims) },
         _ => scalar::claim(0, disparity, cost, claims),
     }
 }
@@ -51,6 +56,9 @@ pub(super) fn keep(level: Level, claims: &[u32], most: u16, disparity: &mut [i16
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { avx2::keep(claims, most, disparity) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::keep(claims, most, disparity) },
         _ => scalar::keep(0, claims, most, disparity),
     }
 }
@@ -66,6 +74,9 @@ pub(super) fn take(level: Level, disparity: &[i16], cost: &[u8], most: u8, taken
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { avx2::take(disparity, cost, most, taken) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::take(disparity, cost, most, taken) },
         _ => scalar::take(0, disparity, cost, most, taken),
     }
 }

@@ -11,6 +11,8 @@ mod scalar;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 
 use super::kernels::Kernels;
 use crate::{Level, Sample};
@@ -47,7 +49,10 @@ pub(crate) struct Static<'a> {
 /// Fills `out` for pixels `x0..x0 + len` of the rows in `left`: an even number of rows of the
 /// image's width (a last odd frame is followed by a row of zeros). Pixels beyond the image get
 /// zeros, and so do gradients within [`REACH`] of its sides.
-#[cfg_attr(not(target_arch = "x86_64"), allow(unused_variables, unreachable_code))]
+#[cfg_attr(
+    not(any(target_arch = "x86_64", target_arch = "aarch64")),
+    allow(unused_variables, unreachable_code)
+)]
 pub(crate) fn static_row(
     level: Level,
     left: &[&[Sample]],
@@ -69,6 +74,8 @@ pub(crate) fn static_row(
         Level::Avx512 => 32,
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => 16,
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => 8,
         _ => return scalar::pixels(kernels, left, x0, 0..len, out),
     };
     // Whole blocks whose kernel stays inside the image, counted from `from`.
@@ -90,6 +97,9 @@ pub(crate) fn static_row(
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { avx2::blocks(kernels, left, x0, at, out) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::blocks(kernels, left, x0, at, out) },
         _ => {}
     }
     scalar::pixels(kernels, left, x0, end..len, out);

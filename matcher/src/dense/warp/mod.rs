@@ -8,6 +8,8 @@ mod scalar;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 
 use super::kernels::{Kernels, PHASES};
 use crate::{Level, Sample};
@@ -81,6 +83,9 @@ pub(crate) fn warp_row(level: Level, source: &Source<'_>, out: &mut Warped<'_>) 
         // SAFETY: as above; rows hold at least 8 samples.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 if width >= 8 => unsafe { avx2::blocks(kernels, source, out) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon if width >= 8 => unsafe { neon::blocks(kernels, source, out) },
         _ => 0,
     };
     scalar::pixels(kernels, source, done..len, out);

@@ -9,6 +9,8 @@ mod scalar;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 
 use crate::Level;
 
@@ -57,6 +59,9 @@ pub(crate) fn weigh(
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { avx2::weigh(gradient, grey, times, out) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::weigh(gradient, grey, times, out) },
         _ => scalar::weigh(gradient, grey, times, out),
     }
 }

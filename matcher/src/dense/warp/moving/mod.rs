@@ -11,6 +11,8 @@ mod scalar;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 
 use super::{FARTHEST, Source, Warped};
 use crate::{
@@ -206,6 +208,9 @@ fn interpolate(level: Level, kernels: &Kernels, row: &[Sample], place: &[i32], g
         // SAFETY: as above, with rows of at least 8 samples.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 if row.len() >= 8 => unsafe { avx2::blocks(kernels, row, place, grey) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon if row.len() >= 8 => unsafe { neon::blocks(kernels, row, place, grey) },
         _ => 0,
     };
     scalar::pixels(kernels, row, &place[done..], &mut grey[done..place.len()]);
