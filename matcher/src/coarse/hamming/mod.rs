@@ -99,6 +99,9 @@ pub(crate) fn nearest(level: Level, value: u64, row: &[u64]) -> Option<(u32, usi
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => unsafe { avx2::nearest(value, row) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::nearest(value, row) },
         _ => scalar::nearest(value, row),
     };
     (!row.is_empty()).then_some(((key >> 32) as u32, key as u32 as usize))
