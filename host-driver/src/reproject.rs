@@ -8,6 +8,7 @@ use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Matrix3, Point3};
 use rayon::prelude::*;
+use stspp_matcher::parallel::Share;
 use stspp_matcher::{Image, Level, Matched, SAMPLES_PER_DN8, Sample};
 
 use crate::{DepthFrame, PointCloud, RectifiedGeometry, SlotLabel};
@@ -78,9 +79,9 @@ impl Row {
 /// Depth of each pixel: z in the left camera's (unrectified) frame in metres, NaN where invalid.
 pub fn depth_of_disparity(geometry: &RectifiedGeometry, disparity_px: &Image<f32>) -> Image<f32> {
     let (width, reprojection) = (disparity_px.width(), Reprojection::new(geometry));
-    let mut depth_m = Image::new(width, disparity_px.height(), 0.0);
+    let mut depth_m = disparity_px.sibling(0.0);
     let bands = depth_m.as_mut_slice().par_chunks_mut(width.max(1) * BAND).enumerate();
-    bands.for_each(|(band, rows)| {
+    bands.share(|(band, rows)| {
         for (k, out) in rows.chunks_mut(width).enumerate() {
             let y = band * BAND + k;
             reprojection.row(y).component(2, 0, disparity_px.row(y), out);
@@ -141,7 +142,7 @@ fn point_cloud_at(level: Level, frame: &DepthFrame, cloud: &mut PointCloud) {
     let infinity = reprojection.disparity_at_infinity_px;
     let mut counts = vec![0_usize; height.div_ceil(BAND)];
     let pixels = disparity_px.as_slice().par_chunks(width.max(1) * BAND);
-    counts.par_iter_mut().zip(pixels).for_each(|(count, band)| {
+    counts.par_iter_mut().zip(pixels).share(|(count, band)| {
         *count = band.iter().map(|&d| i32::from(d - infinity > 0.0)).sum::<i32>() as usize;
     });
     let total = counts.iter().sum();
@@ -164,7 +165,7 @@ fn point_cloud_at(level: Level, frame: &DepthFrame, cloud: &mut PointCloud) {
             rate: rates.split_off_mut(..count).unwrap_or_default(),
         });
     }
-    parts.into_par_iter().enumerate().for_each(|(band, mut part)| {
+    parts.into_par_iter().enumerate().share(|(band, mut part)| {
         let mut at = 0;
         for y in band * BAND..((band + 1) * BAND).min(height) {
             let from = Sources {
@@ -223,11 +224,16 @@ pub fn depth_frame(
     let depth_rate_m_per_s = matched.rate_px_per_s.as_ref().map(|rate| {
         // z is proportional to 1 / parallax, so that dz/dt = -z * (dd/dt) / parallax.
         let infinity = geometry.disparity_at_infinity_px() as f32;
-        let mut out = rate.clone();
-        let sources = depth_m.as_slice().iter().zip(matched.disparity_px.as_slice());
-        for (rate, (z, d)) in out.as_mut_slice().iter_mut().zip(sources) {
-            *rate *= -z / (d - infinity);
-        }
+        let mut out = rate.sibling(0.0);
+        let run = out.width().max(1) * BAND;
+        let sources = (depth_m.as_slice().par_chunks(run))
+            .zip(matched.disparity_px.as_slice().par_chunks(run))
+            .zip(rate.as_slice().par_chunks(run));
+        out.as_mut_slice().par_chunks_mut(run).zip(sources).share(|(out, ((z, d), rate))| {
+            for (((out, z), d), rate) in out.iter_mut().zip(z).zip(d).zip(rate) {
+                *out = rate * (-z / (d - infinity));
+            }
+        });
         out
     });
     let time_device_s = match labels.last() {

@@ -14,6 +14,7 @@ use crate::{
         settle::Settle,
     },
     lanes::vectorised,
+    parallel::Share,
     regions::Regions,
 };
 
@@ -190,18 +191,16 @@ fn invalid_together(
 ) {
     let band = BAND * to.width().max(1);
     let bands = to.as_mut_slice().par_chunks_mut(band);
-    bands.zip(disparity.as_slice().par_chunks(band)).enumerate().for_each(
-        |(k, (to, disparity))| {
-            vectorised!(
-                level,
-                together_loop(
-                    disparity: &[f32] = disparity,
-                    from: Option<&[f32]> = from.map(|from| &from.as_slice()[k * band..]),
-                    to: &mut [f32] = to,
-                )
-            );
-        },
-    );
+    bands.zip(disparity.as_slice().par_chunks(band)).enumerate().share(|(k, (to, disparity))| {
+        vectorised!(
+            level,
+            together_loop(
+                disparity: &[f32] = disparity,
+                from: Option<&[f32]> = from.map(|from| &from.as_slice()[k * band..]),
+                to: &mut [f32] = to,
+            )
+        );
+    });
 }
 
 #[inline(always)]
@@ -223,7 +222,7 @@ fn together_loop(disparity: &[f32], from: Option<&[f32]>, to: &mut [f32]) {
 /// The coarse map as the fit's start, without what the masks exclude.
 fn begin(level: Level, stack: &StereoStack<'_>, map: &CoarseMap, start: &mut Image<f32>) {
     let width = stack.width();
-    start.as_mut_slice().par_chunks_mut(width * BAND).enumerate().for_each(|(band, rows)| {
+    start.as_mut_slice().par_chunks_mut(width * BAND).enumerate().share(|(band, rows)| {
         for (k, start) in rows.chunks_mut(width).enumerate() {
             let y = band * BAND + k;
             let right = stack.right_mask.map(|mask| mask.row(y));

@@ -1,6 +1,7 @@
 //! A dense row-major image.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 /// A `width` x `height` image, rows contiguous and without padding.
 ///
@@ -14,6 +15,35 @@ pub struct Image<T> {
     /// The first pixel in `data`.
     from: usize,
     data: Vec<T>,
+    /// Where its memory goes when it is dropped, if anywhere.
+    home: Weak<Memory<T>>,
+}
+
+/// Memory of images that were dropped.
+type Memory<T> = Mutex<Vec<(usize, Vec<T>)>>;
+
+/// Most images whose memory a [`Spares`] keeps.
+const SPARES_MAX: usize = 8;
+
+/// Makes images whose memory comes back when they are dropped, wherever that is, for the next ones: a
+/// system clears the pages of new memory, which for a map of a frame takes as long as to fill it. An image
+/// that is kept keeps its memory, and so does a copy of one, which has nothing to do with this.
+#[derive(Debug)]
+pub struct Spares<T>(Arc<Memory<T>>);
+
+impl<T> Default for Spares<T> {
+    fn default() -> Self {
+        Self(Arc::default())
+    }
+}
+
+impl<T: Copy> Spares<T> {
+    /// An image of any contents: what an earlier one held, or `fill`.
+    pub fn image(&self, width: usize, height: usize, fill: T) -> Image<T> {
+        let mut image = Image::from_memory(&self.0, width, height, fill);
+        image.home = Arc::downgrade(&self.0);
+        image
+    }
 }
 
 /// Allocations of this many bytes begin at a page.
@@ -30,19 +60,42 @@ impl<T: Copy> Image<T> {
         let len = width * height;
         let size = size_of::<T>();
         if len * size < LARGE || !SPAN.is_multiple_of(size) {
-            return Self { width, height, from: 0, data: vec![fill; len] };
+            return Self { width, height, from: 0, data: vec![fill; len], home: Weak::new() };
         }
         static PLACE: AtomicUsize = AtomicUsize::new(0);
         let place = PLACE.fetch_add(1, Ordering::Relaxed).wrapping_mul(STEP) % SPAN;
         let data = vec![fill; len + SPAN / size];
         // What is there or not depends on the address; no value does.
         let from = place.wrapping_sub(data.as_ptr().addr()) % SPAN / size;
-        Self { width, height, from, data }
+        Self { width, height, from, data, home: Weak::new() }
+    }
+
+    fn from_memory(memory: &Memory<T>, width: usize, height: usize, fill: T) -> Self {
+        let mut spare = memory.lock().unwrap_or_else(PoisonError::into_inner);
+        let fits = |(from, data): &(usize, Vec<T>)| data.len() >= from + width * height;
+        let found = spare.iter().rposition(fits).map(|i| spare.swap_remove(i));
+        drop(spare);
+        match found {
+            Some((from, data)) => Self { width, height, from, data, home: Weak::new() },
+            None => Self::new(width, height, fill),
+        }
+    }
+
+    /// Another image of this size and any contents, from the same [`Spares`] if there is one; else all
+    /// of `fill`.
+    pub fn sibling(&self, fill: T) -> Self {
+        let Some(memory) = self.home.upgrade() else {
+            return Self::new(self.width, self.height, fill);
+        };
+        let mut image = Self::from_memory(&memory, self.width, self.height, fill);
+        image.home = Weak::clone(&self.home);
+        image
     }
 
     /// Takes row-major `data`; `None` when its length is not `width * height`.
     pub fn from_vec(width: usize, height: usize, data: Vec<T>) -> Option<Self> {
-        (data.len() == width.checked_mul(height)?).then_some(Self { width, height, from: 0, data })
+        let fits = data.len() == width.checked_mul(height)?;
+        fits.then_some(Self { width, height, from: 0, data, home: Weak::new() })
     }
 
     /// Width in pixels.
@@ -99,22 +152,24 @@ impl<T: Copy> Image<T> {
 
     /// The pixels, row-major.
     pub fn into_vec(mut self) -> Vec<T> {
-        self.data.truncate(self.from + self.width * self.height);
-        self.data.drain(..self.from);
-        self.data
+        let mut data = std::mem::take(&mut self.data);
+        data.truncate(self.from + self.width * self.height);
+        data.drain(..self.from);
+        data
     }
 
     /// Applies `f` to every pixel.
     pub fn map<U>(&self, f: impl FnMut(T) -> U) -> Image<U> {
         let data = self.as_slice().iter().copied().map(f).collect();
-        Image { width: self.width, height: self.height, from: 0, data }
+        Image { width: self.width, height: self.height, from: 0, data, home: Weak::new() }
     }
 }
 
 impl<T: Copy> Clone for Image<T> {
     fn clone(&self) -> Self {
         let Some(&first) = self.as_slice().first() else {
-            return Self { width: self.width, height: self.height, from: 0, data: Vec::new() };
+            let (width, height) = (self.width, self.height);
+            return Self { width, height, from: 0, data: Vec::new(), home: Weak::new() };
         };
         let mut copy = Self::new(self.width, self.height, first);
         copy.as_mut_slice().copy_from_slice(self.as_slice());
@@ -130,6 +185,16 @@ impl<T: Copy> Clone for Image<T> {
     }
 }
 
+impl<T> Drop for Image<T> {
+    fn drop(&mut self) {
+        let Some(home) = self.home.upgrade() else { return };
+        let mut spare = home.lock().unwrap_or_else(PoisonError::into_inner);
+        if spare.len() < SPARES_MAX && !self.data.is_empty() {
+            spare.push((self.from, std::mem::take(&mut self.data)));
+        }
+    }
+}
+
 impl<T: Copy + PartialEq> PartialEq for Image<T> {
     fn eq(&self, other: &Self) -> bool {
         (self.width, self.height) == (other.width, other.height)
@@ -140,6 +205,30 @@ impl<T: Copy + PartialEq> PartialEq for Image<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn memory_comes_back_when_images_are_dropped() {
+        let spares = Spares::default();
+        let at = |image: &Image<f32>| image.as_slice().as_ptr();
+        let first = spares.image(400, 100, 1.0);
+        let second = first.sibling(2.0);
+        assert_eq!((first.get(9, 9), second.get(9, 9)), (Some(1.0), Some(2.0)));
+        let (a, b) = (at(&first), at(&second));
+        std::thread::spawn(move || drop(first)).join().unwrap();
+        // What is kept, or copied, or made another thing of, is its owner's.
+        let copy = second.clone();
+        let again = spares.image(400, 100, 3.0);
+        assert_eq!((at(&again), again.get(0, 0)), (a, Some(1.0)));
+        drop(copy);
+        assert_eq!(spares.image(400, 100, 4.0).get(0, 0), Some(4.0));
+        drop(second);
+        assert_eq!(at(&spares.image(300, 50, 5.0)), b);
+        assert_eq!(again.into_vec().len(), 40_000);
+        let last = spares.image(400, 500, 6.0);
+        assert_eq!(last.row(100), [6.0; 400]);
+        drop(spares);
+        drop(last);
+    }
 
     #[test]
     fn large_images_hold_what_small_ones_do_wherever_they_begin() {

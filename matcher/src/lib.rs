@@ -36,7 +36,7 @@ pub mod wta;
 pub mod zncc;
 
 pub use error::Error;
-pub use image::Image;
+pub use image::{Image, Spares};
 pub use level::Level;
 pub use matched::{Matched, StageTime};
 pub use params::{Advanced, DisparityRange, Interpolation, Method, Params, ShapeFunction};

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use crate::{
-    Error, Image, Level, Matched, Method, Params, ShapeFunction, StageTime, StereoStack,
+    Error, Image, Level, Matched, Method, Params, ShapeFunction, Spares, StageTime, StereoStack,
     census::{PaddedStack, Side},
     check,
     cpu_time::process_cpu_ms,
@@ -37,6 +37,9 @@ pub struct Matcher {
     order: OrderChoice,
     /// Made by the first frame that needs it.
     fast: Option<Fast>,
+    /// Memory of results that their reader is done with.
+    spare_maps: Spares<f32>,
+    spare_brightness: Spares<u8>,
 }
 
 impl Matcher {
@@ -60,6 +63,8 @@ impl Matcher {
             regions: Regions::default(),
             order: OrderChoice::default(),
             fast: None,
+            spare_maps: Spares::default(),
+            spare_brightness: Spares::default(),
         })
     }
 
@@ -81,17 +86,33 @@ impl Matcher {
         self.level
     }
 
+    /// Where the stages run: what else a frame takes can run there, too ([`Pool::frame`]).
+    pub fn pool(&self) -> &Pool {
+        &self.pool
+    }
+
     /// Number of threads the stages are spread over.
     pub fn threads(&self) -> usize {
         self.pool.threads()
     }
 
-    /// Disparity and similarity of one stack.
+    /// Disparity and similarity of one stack. With [`Method::Dense`], the memory of earlier results that
+    /// were dropped is used again.
     ///
     /// # Errors
     /// [`Error::FrameCount`] and [`Error::Shape`] for a stack that cannot be matched.
     pub fn match_stack(&mut self, stack: &StereoStack<'_>) -> Result<Matched, Error> {
+        stack.check()?;
         let mut out = Matched::default();
+        if self.params.method == Method::Dense {
+            let (width, height) = (stack.width(), stack.height());
+            out.disparity_px = self.spare_maps.image(width, height, f32::NAN);
+            out.zncc = self.spare_maps.image(width, height, f32::NAN);
+            if self.params.motion && stack.times_s.is_some() {
+                out.rate_px_per_s = Some(self.spare_maps.image(width, height, 0.0));
+            }
+            out.brightness = Some(self.spare_brightness.image(width, height, 0));
+        }
         self.match_into(stack, &mut out)?;
         Ok(out)
     }
@@ -104,11 +125,11 @@ impl Matcher {
     pub fn match_into(&mut self, stack: &StereoStack<'_>, out: &mut Matched) -> Result<(), Error> {
         stack.check()?;
         let pool = self.pool.clone();
-        pool.install(|| match self.params.method {
-            Method::Parabola => *out = self.parabola(stack),
-            Method::IcGn => *out = self.icgn(stack),
-            Method::Dense => self.dense(stack, out),
-        });
+        match self.params.method {
+            Method::Parabola => *out = pool.install(|| self.parabola(stack)),
+            Method::IcGn => *out = pool.install(|| self.icgn(stack)),
+            Method::Dense => pool.frame(|| self.dense(stack, out)),
+        }
         Ok(())
     }
 

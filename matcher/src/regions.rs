@@ -8,7 +8,7 @@
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, lanes::vectorised};
+use crate::{Image, Level, lanes::vectorised, parallel::Share};
 
 /// Neighbours that differ by less are on one surface.
 pub const STEP_PX: f32 = 1.5;
@@ -76,7 +76,7 @@ impl Regions {
         self.flags.resize(width * height, NONE);
         let level = self.level;
         let bands = self.flags.par_chunks_mut((width * BAND).max(1)).enumerate();
-        bands.for_each(|(band, flags)| {
+        bands.share(|(band, flags)| {
             for (k, flags) in flags.chunks_mut(width).enumerate() {
                 flag_row(level, map.row(band * BAND + k), flags);
             }

@@ -158,8 +158,11 @@ impl DepthEngine {
             left: self.rectifier.canvas(),
             right: self.rectifier.canvas(),
         });
-        self.rectifier.rectify_left(&pair.left, &mut rectified.left, &mut self.scratch)?;
-        self.rectifier.rectify_right(&pair.right, &mut rectified.right, &mut self.scratch)?;
+        let Self { rectifier, scratch, matcher, .. } = self;
+        matcher.pool().frame(|| {
+            rectifier.rectify_left(&pair.left, &mut rectified.left, scratch)?;
+            rectifier.rectify_right(&pair.right, &mut rectified.right, scratch)
+        })?;
         Ok(self.window.push(label, rectified))
     }
 
@@ -170,6 +173,11 @@ impl DepthEngine {
 
     /// Matches the complete window.
     pub fn match_window(&mut self) -> Result<DepthFrame, Error> {
+        let pool = self.matcher.pool().clone();
+        pool.frame(|| self.depth_frame())
+    }
+
+    fn depth_frame(&mut self) -> Result<DepthFrame, Error> {
         let labels: Vec<SlotLabel> = self.window.pairs().map(|(label, _)| *label).collect();
         let left: Vec<_> = self.window.pairs().map(|(_, pair)| &pair.left).collect();
         let right: Vec<_> = self.window.pairs().map(|(_, pair)| &pair.right).collect();

@@ -10,6 +10,7 @@ use std::sync::Arc;
 
 use nalgebra::{Rotation3, Vector2, Vector3};
 use rayon::prelude::*;
+use stspp_matcher::parallel::Share;
 use stspp_matcher::{Image, Level, Sample};
 
 use super::kernel::{PHASE_BITS, TAP_BITS, TAPS, TAPS_BEFORE, TapTables};
@@ -139,7 +140,7 @@ impl Warp {
             .par_chunks_mut(stride * BAND)
             .zip(scratch.lines.par_chunks_mut(line_len))
             .enumerate()
-            .for_each(|(band, (rows, line))| {
+            .share(|(band, (rows, line))| {
                 for (k, out) in rows.chunks_mut(stride).enumerate() {
                     let y = band * BAND + k;
                     lines.read(y, line);
@@ -156,7 +157,7 @@ impl Warp {
             between.copy_within((end - 1) * stride..end * stride, y * stride);
         }
         let taps = self.taps.plain();
-        out.as_mut_slice().par_chunks_mut(w * BAND).enumerate().for_each(|(band, rows)| {
+        out.as_mut_slice().par_chunks_mut(w * BAND).enumerate().share(|(band, rows)| {
             for (k, out) in rows.chunks_mut(w).enumerate() {
                 let row = self.along_columns.row(band * BAND + k);
                 across(self.level, between, stride, row, taps, TAP_BITS, out);

@@ -10,7 +10,11 @@ use super::{
     hamming::{BLOCK, Shifts, best_candidates, nearest, untaken},
     shared,
 };
-use crate::{DisparityRange, Image, Level, Sample, lanes::vectorised, parallel::PerThread};
+use crate::{
+    DisparityRange, Image, Level, Sample,
+    lanes::vectorised,
+    parallel::{PerThread, Share},
+};
 
 /// Rows between seed rows, and rows of a block.
 pub(crate) const SEED_ROWS: usize = 16;
@@ -132,7 +136,7 @@ impl Search {
     pub(crate) fn run(&mut self, scene: &Scene<'_>, map: &mut CoarseMap) {
         self.seed(scene, map.disparity.height());
         let (seeds, scratch) = (&self.seeds, self.scratch.ready());
-        map.bands(SEED_ROWS).for_each(|mut band| {
+        map.bands(SEED_ROWS).share(|mut band| {
             scratch.with(|s| search_band(scene, seeds, s, &mut band));
         });
     }
@@ -149,11 +153,11 @@ impl Search {
         let height = raw.disparity.height();
         self.seed(scene, height);
         let (seeds, scratch) = (&self.seeds, self.scratch.ready());
-        raw.bands(SEED_ROWS).zip(map.bands(SEED_ROWS)).for_each(|(mut band, mut cleaned)| {
+        raw.bands(SEED_ROWS).zip(map.bands(SEED_ROWS)).share(|(mut band, mut cleaned)| {
             scratch.with(|s| search_band(scene, seeds, s, &mut band));
             rows.with(|rows| clean::inner_rows(scene, height, &band, rows, &mut cleaned));
         });
-        map.bands(SEED_ROWS).for_each(|mut cleaned| {
+        map.bands(SEED_ROWS).share(|mut cleaned| {
             rows.with(|rows| clean::outer_rows(scene, raw, rows, &mut cleaned));
         });
     }
@@ -162,7 +166,7 @@ impl Search {
     fn seed(&mut self, scene: &Scene<'_>, height: usize) {
         let half = scene.left.width().div_ceil(2);
         self.seeds.resize(half * height.div_ceil(SEED_ROWS), INVALID);
-        self.seeds.par_chunks_mut(half).enumerate().for_each(|(band, seeds)| {
+        self.seeds.par_chunks_mut(half).enumerate().share(|(band, seeds)| {
             let y = (band * SEED_ROWS + SEED_ROWS / 2).min(height - 1);
             seed_row(scene, y, seeds);
         });

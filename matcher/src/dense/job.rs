@@ -61,13 +61,8 @@ pub(crate) fn image_rows<'a>(images: &[&'a Image<Sample>], y: isize) -> [&'a [Sa
     std::array::from_fn(|i| images.get(i).map_or(&[][..], |image| image.row(y as usize)))
 }
 
-/// Ranges of columns of a band that are to be fitted: all, or those of the blocks set in `again`.
-pub(super) fn columns(
-    width: usize,
-    band: usize,
-    again: Option<&Image<bool>>,
-) -> Vec<(usize, usize)> {
-    let Some(again) = again else { return vec![(0, width)] };
+/// Ranges of columns of a band of [`BAND`] rows whose blocks are set in `again`.
+pub(super) fn columns(width: usize, band: usize, again: &Image<bool>) -> Vec<(usize, usize)> {
     let per_band = BAND / BLOCK;
     let rows = band * per_band..((band + 1) * per_band).min(again.height());
     let set = |column: usize| rows.clone().any(|row| again.row(row)[column]);

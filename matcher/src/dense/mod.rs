@@ -29,7 +29,10 @@ pub(crate) mod warp;
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, Sample, ShapeFunction, StereoStack, parallel::PerThread};
+use crate::{
+    Image, Level, Sample, ShapeFunction, StereoStack,
+    parallel::{self, Share},
+};
 use job::{BAND, Job, Output, columns, origin};
 use motion::{BLOCK, Motion, along::Watch, sums::Blocks};
 use solve::Fits;
@@ -39,7 +42,9 @@ use tile::Tile;
 /// Columns a tile fits. Narrower strips would keep a tile's rows in a core's second-level cache, but cost
 /// more than that saves: memory gives short pieces of twenty images' rows slowly.
 const STRIP: usize = 2048;
-/// Tasks of a thread: they let others take over what a busy core leaves.
+/// Bands of a run that are left to its thread: another would compute as many rows anew at their ends.
+const LEFT: usize = 4;
+/// Tasks of a thread where loops are rayon's: they let others take over what a busy core leaves.
 const TASKS: usize = 4;
 
 /// The dense fit; keeps its buffers between frames.
@@ -49,7 +54,7 @@ pub struct DenseFit {
     radius: usize,
     shape: ShapeFunction,
     surface_px: f32,
-    tiles: PerThread<Tile>,
+    tiles: parallel::PerThread<Tile>,
     /// Number of fits made.
     stamp: u64,
     zero: Image<Sample>,
@@ -90,7 +95,7 @@ impl DenseFit {
             radius: radius.clamp(2, 8),
             shape,
             surface_px,
-            tiles: PerThread::default(),
+            tiles: parallel::PerThread::default(),
             stamp: 0,
             zero: Image::new(0, 0, 0),
             watches: true,
@@ -160,7 +165,6 @@ impl DenseFit {
         if (self.zero.width(), self.zero.height()) != (width, height) {
             self.zero = Image::new(width, height, 0);
         }
-        let threads = rayon::current_num_threads().max(1);
         let frames = stack.frames();
         let mut left = [&self.zero; 16];
         let mut right = [&self.zero; 16];
@@ -186,8 +190,10 @@ impl DenseFit {
         self.saw = job.watch.is_some();
         self.seen.begin(width, height);
         let tiles = self.tiles.ready();
+        let (threads, shared) = (parallel::threads(), parallel::is_shared());
         // Results do not depend on where bands end, as long as they hold whole blocks.
         let band_rows = match again {
+            None if shared => BLOCK,
             None => height.div_ceil(TASKS * threads).max(BAND).next_multiple_of(BLOCK),
             Some(_) => BAND,
         };
@@ -202,12 +208,12 @@ impl DenseFit {
             .zip(brightness.as_mut_slice().par_chunks_mut(rows))
             .zip(self.seen.blocks.par_chunks_mut(blocks))
             .enumerate()
-            .for_each(|(band, ((((first, second), zncc), brightness), blocks))| {
+            .share_runs(LEFT, |(band, ((((first, second), zncc), brightness), blocks))| {
                 // Fits made anew leave it as it is.
                 let brightness = again.is_none().then_some(brightness);
                 let mut out = Output { first, second, zncc, brightness, blocks };
                 tiles.with(|tile| {
-                    for (from, to) in columns(width, band, again.map(|(_, blocks)| blocks)) {
+                    let mut fit = |(from, to): (usize, usize)| {
                         let strips = (to - from).div_ceil(STRIP);
                         for strip in 0..strips {
                             let part = |k: usize| match k == strips {
@@ -217,6 +223,10 @@ impl DenseFit {
                             let columns = (part(strip), part(strip + 1));
                             tile.run(&job, columns, band * band_rows, &mut out);
                         }
+                    };
+                    match again {
+                        None => fit((0, width)),
+                        Some((_, again)) => columns(width, band, again).into_iter().for_each(fit),
                     }
                 });
             });

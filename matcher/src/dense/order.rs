@@ -23,7 +23,7 @@ use super::{
 use crate::{
     Image, Level,
     lanes::{Lanes, WIDEST, dispatch, vectorised},
-    parallel::PerThread,
+    parallel::{PerThread, Share},
 };
 
 /// Radius of the smoothing: 13 x 13 pixels.
@@ -102,7 +102,7 @@ impl OrderChoice {
             .par_chunks_mut(width * BAND)
             .zip(zncc.as_mut_slice().par_chunks_mut(width * BAND))
             .enumerate()
-            .for_each(|(band, (out, zncc))| {
+            .share(|(band, (out, zncc))| {
                 bands.with(|b| {
                     b.resize(width);
                     let top = band * BAND;
@@ -331,7 +331,7 @@ pub fn accept(map: &Image<f32>, zncc_min: f32, zncc: &mut Image<f32>, out: &mut 
         .par_chunks_mut(width * BAND)
         .zip(zncc.as_mut_slice().par_chunks_mut(width * BAND))
         .zip(map.as_slice().par_chunks(width * BAND))
-        .for_each(|((out, zncc), map)| {
+        .share(|((out, zncc), map)| {
             for ((out, z), &d) in out.iter_mut().zip(zncc).zip(map) {
                 let good = *z >= zncc_min && !d.is_nan();
                 *out = if good { d } else { f32::NAN };

@@ -11,6 +11,7 @@ use super::DenseMaps;
 use crate::{
     Image, Level, StereoStack,
     lanes::vectorised,
+    parallel::Share,
     step::{BLOCK, FRAMES_MIN, Limits, Samples, StepJudge, for_columns},
 };
 
@@ -79,7 +80,7 @@ impl Settle {
         self.mark_blocks(step);
         let around = &self.around;
         let rows = self.judged.as_mut_slice().par_chunks_mut(width).enumerate();
-        rows.for_each(|(y, row)| {
+        rows.share(|(y, row)| {
             for_columns(Some(around), y, width, |from, to| {
                 let found = maps.first_px.row(y)[from..to].iter().zip(&maps.zncc.row(y)[from..to]);
                 for (to, (&d, &z)) in row[from..to].iter_mut().zip(found) {
@@ -113,7 +114,7 @@ impl Settle {
         let starts = start.as_mut_slice().par_chunks_mut(width);
         let rows = maps.first_px.as_mut_slice().par_chunks_mut(width);
         let rows = rows.zip(maps.second_px.as_mut_slice().par_chunks_mut(width)).zip(starts);
-        rows.enumerate().for_each(|(y, ((first, second), start))| {
+        rows.enumerate().share(|(y, ((first, second), start))| {
             for_columns(Some(blocks), y, width, |from, to| {
                 vectorised!(
                     level,

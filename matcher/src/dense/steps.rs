@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, lanes::vectorised, params::RADIUS_LIMIT};
+use crate::{Image, Level, lanes::vectorised, parallel::Share, params::RADIUS_LIMIT};
 
 /// Rows of a task.
 const BAND: usize = 32;
@@ -39,7 +39,7 @@ pub fn mark_steps(
         *out = Image::new(width, height, 0);
     }
     let bands = out.as_mut_slice().par_chunks_mut((width * BAND).max(1)).enumerate();
-    bands.for_each(|(band, marks)| {
+    bands.share(|(band, marks)| {
         let rows = marks.len() / width;
         let strips = (0..width).step_by(STRIP);
         for x0 in strips {

@@ -24,7 +24,12 @@ mod signature;
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, StereoStack, lanes::vectorised, parallel::PerThread, regions::joined};
+use crate::{
+    Image, Level, StereoStack,
+    lanes::vectorised,
+    parallel::{PerThread, Share},
+    regions::joined,
+};
 use candidates::plane;
 use decide::Judge;
 pub use decide::{FRAMES_MIN, LIGHT_MIN, NEXT_LIGHT_MIN, SIMILARITY_MIN};
@@ -186,7 +191,7 @@ impl StepJudge {
             self.proposals.resize(self.open.len(), None);
             let level = self.level;
             let parts = self.open.par_chunks(TASK).zip(self.proposals.par_chunks_mut(TASK));
-            parts.for_each(|(open, to)| {
+            parts.share(|(open, to)| {
                 vectorised!(
                     level,
                     judge_loop(
@@ -249,7 +254,7 @@ impl StepJudge {
     ) {
         let (width, height) = (disparity_px.width(), disparity_px.height());
         let level = self.level;
-        self.beside.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, out)| {
+        self.beside.as_mut_slice().par_chunks_mut(width).enumerate().share(|(y, out)| {
             let (above, below) = (y.saturating_sub(1), (y + 1).min(height - 1));
             let rows = [above, y, below].map(|y| disparity_px.row(y));
             out.fill(0);
@@ -277,7 +282,7 @@ impl StepJudge {
             self.near = Image::new(width, height, 0);
         }
         let (level, beside, columns) = (self.level, &self.beside, self.columns.ready());
-        self.near.as_mut_slice().par_chunks_mut(width).enumerate().for_each(|(y, out)| {
+        self.near.as_mut_slice().par_chunks_mut(width).enumerate().share(|(y, out)| {
             let rows = y.saturating_sub(NEAR_RADIUS)..(y + NEAR_RADIUS + 1).min(height);
             for_columns(blocks, y, width, |from, to| {
                 columns.with(|column| {

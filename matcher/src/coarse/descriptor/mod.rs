@@ -13,7 +13,11 @@ mod neon;
 
 use rayon::prelude::*;
 
-use crate::{Image, Level, Sample, aligned::Aligned, parallel::PerThread};
+use crate::{
+    Image, Level, Sample,
+    aligned::Aligned,
+    parallel::{PerThread, Share},
+};
 use codes::{BLOCK, Codes};
 
 /// Margin of right descriptor rows on both sides, so that whole blocks of candidates can be read.
@@ -113,7 +117,7 @@ impl Descriptors {
         };
         let stride = self.stride;
         let scratch = scratch.0.ready();
-        self.data.par_chunks_mut(stride * BAND).enumerate().for_each(|(band, rows)| {
+        self.data.par_chunks_mut(stride * BAND).enumerate().share(|(band, rows)| {
             scratch.with(|codes| {
                 codes.begin(level, images, band * BAND);
                 for (y, out) in (band * BAND..).zip(rows.chunks_mut(stride)) {

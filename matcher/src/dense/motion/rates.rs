@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::{BLOCK, Times, sums::Blocks};
-use crate::Image;
+use crate::{Image, parallel::Share};
 
 /// Blocks on each side that the plane is fitted through: 80 x 80 pixels.
 const REACH: usize = 2;
@@ -71,7 +71,7 @@ impl Rates {
         let noise = self.noise();
         let own = &self.own;
         let (columns, rows) = (self.columns, self.rows);
-        self.around.par_chunks_mut(columns).enumerate().for_each(|(row, around)| {
+        self.around.par_chunks_mut(columns).enumerate().share(|(row, around)| {
             for (column, around) in around.iter_mut().enumerate() {
                 *around = plane(own, (columns, rows), (column, row), noise);
             }
@@ -128,29 +128,27 @@ impl Rates {
     /// The rate of each pixel with a disparity, from the blocks of its surface around it; zero elsewhere.
     pub fn expand(&self, blocks: &Blocks, disparity_px: &Image<f32>, rate: &mut Image<f32>) {
         let width = disparity_px.width();
-        rate.as_mut_slice().par_chunks_mut(width * BLOCK / 2).enumerate().for_each(
-            |(half, rows)| {
-                // Rows between the same two rows of block centres.
-                let top = (half as isize - 1).div_euclid(2);
-                let lines = [top, top + 1].map(|r| r.clamp(0, self.rows as isize - 1) as usize);
-                let still = |r: usize| {
-                    let from = r.saturating_sub(1) * self.columns;
-                    let to = ((r + 2) * self.columns).min(self.around.len());
-                    self.around[from..to].iter().all(|a| a.rate == 0.0)
-                };
-                if lines.into_iter().all(still) {
-                    rows.fill(0.0);
-                    return;
+        rate.as_mut_slice().par_chunks_mut(width * BLOCK / 2).enumerate().share(|(half, rows)| {
+            // Rows between the same two rows of block centres.
+            let top = (half as isize - 1).div_euclid(2);
+            let lines = [top, top + 1].map(|r| r.clamp(0, self.rows as isize - 1) as usize);
+            let still = |r: usize| {
+                let from = r.saturating_sub(1) * self.columns;
+                let to = ((r + 2) * self.columns).min(self.around.len());
+                self.around[from..to].iter().all(|a| a.rate == 0.0)
+            };
+            if lines.into_iter().all(still) {
+                rows.fill(0.0);
+                return;
+            }
+            for (k, row) in rows.chunks_mut(width).enumerate() {
+                let y = half * BLOCK / 2 + k;
+                let v = (y as f32 + 0.5) / BLOCK as f32 - 0.5;
+                for (x, (rate, &d)) in row.iter_mut().zip(disparity_px.row(y)).enumerate() {
+                    *rate = if d.is_nan() { 0.0 } else { self.at(blocks, x, v, lines, d) };
                 }
-                for (k, row) in rows.chunks_mut(width).enumerate() {
-                    let y = half * BLOCK / 2 + k;
-                    let v = (y as f32 + 0.5) / BLOCK as f32 - 0.5;
-                    for (x, (rate, &d)) in row.iter_mut().zip(disparity_px.row(y)).enumerate() {
-                        *rate = if d.is_nan() { 0.0 } else { self.at(blocks, x, v, lines, d) };
-                    }
-                }
-            },
-        );
+            }
+        });
     }
 
     /// The rate at column `x` and height `v` in blocks, between two lines of blocks.

@@ -1,7 +1,5 @@
 //! The rate's normal equations per block, from every [`ROWS_APART`]th row.
 
-use std::sync::Mutex;
-
 use rayon::prelude::*;
 
 use super::{
@@ -17,6 +15,7 @@ use crate::{
         warp::{Source, Warped, moving, warp_row},
     },
     lanes::vectorised,
+    parallel::{PerThread, Share},
 };
 
 /// Every how manyth row is summed: dots are taller than half of this.
@@ -63,7 +62,7 @@ pub(crate) struct Blocks {
     pub columns: usize,
     pub rows: usize,
     pub blocks: Vec<Block>,
-    scratch: Vec<Mutex<Scratch>>,
+    scratch: PerThread<Scratch>,
 }
 
 /// Sums over time of a row, and their sums over rows.
@@ -109,13 +108,9 @@ impl Blocks {
     pub fn sum(&mut self, frame: &Frame<'_>, motion: Option<&Motion>) {
         let (width, height) = (frame.stack.width(), frame.stack.height());
         self.begin(width, height);
-        let threads = rayon::current_num_threads().max(1);
-        self.scratch.resize_with(threads.max(self.scratch.len()), Mutex::default);
-        let scratch = &self.scratch;
-        self.blocks.par_chunks_mut(self.columns).enumerate().for_each(|(row, blocks)| {
-            let thread = rayon::current_thread_index().unwrap_or(0) % scratch.len();
-            let mut s = scratch[thread].lock().unwrap_or_else(|e| e.into_inner());
-            s.row_of_blocks(frame, motion, row * BLOCK, blocks);
+        let scratch = self.scratch.ready();
+        self.blocks.par_chunks_mut(self.columns).enumerate().share(|(row, blocks)| {
+            scratch.with(|s| s.row_of_blocks(frame, motion, row * BLOCK, blocks));
         });
     }
 }

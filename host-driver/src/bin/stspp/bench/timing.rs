@@ -91,17 +91,14 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let mut best: Option<(Vec<Step>, usize)> = None;
     let (mut scratch, mut cloud) = (RectifyScratch::default(), PointCloud::default());
     let (mut left, mut right) = (stack.rectifier.canvas(), stack.rectifier.canvas());
-    for _ in 0..args.repeat.max(1) {
+    let pool = matcher.pool().clone();
+    let mut frame = || {
         let mut watch = Stopwatch::default();
         // A stream rectifies the newest pair only: the others are in its window already.
-        let rectified = stack
-            .rectifier
-            .rectify_left(&newest.left, &mut left, &mut scratch)
-            .and_then(|()| stack.rectifier.rectify_right(&newest.right, &mut right, &mut scratch));
-        rectified.map_err(|e| failed(e.into()))?;
+        stack.rectifier.rectify_left(&newest.left, &mut left, &mut scratch)?;
+        stack.rectifier.rectify_right(&newest.right, &mut right, &mut scratch)?;
         watch.step("rectify");
-        let mut matched =
-            stack.matched(&mut matcher, 0..stack.len()).map_err(|e| failed(e.into()))?;
+        let mut matched = stack.matched(&mut matcher, 0..stack.len())?;
         watch.step("match");
         let inner: Vec<Step> = matched
             .stages
@@ -118,8 +115,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
             reproject::depth_frame(stack.rectifier.geometry(), matched, intensity, Vec::new());
         watch.step("reproject");
         frame.point_cloud_into(&mut cloud);
-        let points = cloud.len();
         watch.step("point cloud");
+        Ok((watch, inner, cloud.len()))
+    };
+    for _ in 0..args.repeat.max(1) {
+        let (watch, inner, points) = pool.frame(&mut frame).map_err(failed)?;
         let steps: Vec<Step> = watch.steps().to_vec();
         let total = |steps: &[Step]| -> f64 {
             let outer = steps.iter().filter(|s| !s.stage.contains('/'));
