@@ -2,6 +2,8 @@
 
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod plain;
 
 use std::sync::{Arc, OnceLock};
@@ -125,7 +127,10 @@ fn pack_row(level: Level, row: &Row, from: &Sources<'_>, part: &mut Part<'_>, at
         // SAFETY: the level is this processor's; lengths are as checked.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 => unsafe { avx512::pack_row(row, from, part, at) },
-        _ => plain::pack_row(row, from, part, at),
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => unsafe { neon::pack_row(row, from, part, at) },
+        _ => plain::pack_row(row, from, part, 0, at),
     }
 }
 

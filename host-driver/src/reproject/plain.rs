@@ -1,4 +1,4 @@
-//! Plain Rust.
+//! Plain Rust, from column `x` on: other levels' rows may end with it.
 
 use nalgebra::Point3;
 
@@ -7,10 +7,16 @@ use super::{Part, Row, Sources};
 /// Pixels that are reprojected before they are packed.
 const RUN: usize = 256;
 
-pub(super) fn pack_row(row: &Row, from: &Sources<'_>, part: &mut Part<'_>, mut at: usize) -> usize {
+pub(super) fn pack_row(
+    row: &Row,
+    from: &Sources<'_>,
+    part: &mut Part<'_>,
+    x: usize,
+    mut at: usize,
+) -> usize {
     let mut xyz = [[0.0_f32; RUN]; 3];
-    for (run, disparities) in from.disparity_px.chunks(RUN).enumerate() {
-        let first = run * RUN;
+    for (run, disparities) in from.disparity_px[x..].chunks(RUN).enumerate() {
+        let first = x + run * RUN;
         for (k, out) in xyz.iter_mut().enumerate() {
             row.component(k, first, disparities, out);
         }
