@@ -87,5 +87,5 @@ pub(super) unsafe fn pack_row(
         }
         x += LANES;
     }
-    plain::pack_row(row, from, part, x, at)
+    if x < n { plain::pack_row(row, from, part, x, at) } else { at }
 }
