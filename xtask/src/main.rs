@@ -29,7 +29,7 @@ cargo xtask firmware [f330] [f350] [--install] [--exercise] [--test]
 cargo xtask firmware flash f330|f350 [--check] [ELF]
                              checks an image and writes it with a debug probe (probe-rs)
 cargo xtask kernels          checks the matcher's kernels under valgrind, compares their instruction
-                             counts, and lets a compiler check the NEON ones
+                             counts, and tests the NEON ones under emulation
 cargo xtask e2e [NAME,...]   plugs the simulated sensor into a Debian kernel in QEMU and tries the
                              stspp binary there: all scenarios, or those with a NAME in their name
 cargo xtask peers            OpenCV's StereoSGBM (by pip, into target/peers) beside our matchers
