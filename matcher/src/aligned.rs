@@ -1,22 +1,19 @@
-//! Buffers that begin at a cache line: a vector of 64 bytes that lies across two lines takes twice as
-//! long to load.
+//! Buffers that begin at a cache line and keep their memory.
 
 use std::ops::{Deref, DerefMut};
 
-/// Bytes of a cache line, and of the widest vector.
-const LINE: usize = 64;
+use crate::memory::Buffer;
 
-/// A growable slice whose first value lies at the start of a cache line.
+/// A slice that can be given another length; its first value lies at the start of a cache line.
 #[derive(Debug)]
 pub(crate) struct Aligned<T> {
-    data: Vec<T>,
-    from: usize,
+    data: Buffer<T>,
     len: usize,
 }
 
 impl<T> Default for Aligned<T> {
     fn default() -> Self {
-        Self { data: Vec::new(), from: 0, len: 0 }
+        Self { data: Buffer::default(), len: 0 }
     }
 }
 
@@ -26,10 +23,11 @@ impl<T: Copy> Aligned<T> {
         if self.len == len {
             return;
         }
-        self.data.clear();
-        self.data.resize(len + LINE / size_of::<T>(), fill);
-        self.from = self.data.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
         self.len = len;
+        match self.data.get_mut(..len) {
+            Some(data) => data.fill(fill),
+            None => self.data = Buffer::new(len, fill),
+        }
     }
 }
 
@@ -37,13 +35,13 @@ impl<T> Deref for Aligned<T> {
     type Target = [T];
 
     fn deref(&self) -> &[T] {
-        &self.data[self.from..][..self.len]
+        &self.data[..self.len]
     }
 }
 
 impl<T> DerefMut for Aligned<T> {
     fn deref_mut(&mut self) -> &mut [T] {
-        &mut self.data[self.from..][..self.len]
+        &mut self.data[..self.len]
     }
 }
 
@@ -56,7 +54,7 @@ mod tests {
         let mut buffer = Aligned::default();
         for len in [1usize, 100, 5000] {
             buffer.resize(len, 2.5f32);
-            assert!(buffer.as_ptr().addr().is_multiple_of(LINE) && buffer.len() == len);
+            assert!(buffer.as_ptr().addr().is_multiple_of(64) && buffer.len() == len);
             assert!(buffer.iter().all(|v| *v == 2.5));
             buffer[0] = 1.0;
             buffer.resize(len, 0.0);

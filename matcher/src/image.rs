@@ -3,6 +3,8 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
+use crate::memory::Buffer;
+
 /// A `width` x `height` image, rows contiguous and without padding.
 ///
 /// Large images begin at addresses that differ from one to the next where the caches tell addresses
@@ -14,13 +16,13 @@ pub struct Image<T> {
     height: usize,
     /// The first pixel in `data`.
     from: usize,
-    data: Vec<T>,
+    data: Buffer<T>,
     /// Where its memory goes when it is dropped, if anywhere.
     home: Weak<Memory<T>>,
 }
 
 /// Memory of images that were dropped.
-type Memory<T> = Mutex<Vec<(usize, Vec<T>)>>;
+type Memory<T> = Mutex<Vec<(usize, Buffer<T>)>>;
 
 /// Most images whose memory a [`Spares`] keeps.
 const SPARES_MAX: usize = 8;
@@ -60,11 +62,17 @@ impl<T: Copy> Image<T> {
         let len = width * height;
         let size = size_of::<T>();
         if len * size < LARGE || !SPAN.is_multiple_of(size) {
-            return Self { width, height, from: 0, data: vec![fill; len], home: Weak::new() };
+            return Self {
+                width,
+                height,
+                from: 0,
+                data: Buffer::new(len, fill),
+                home: Weak::new(),
+            };
         }
         static PLACE: AtomicUsize = AtomicUsize::new(0);
         let place = PLACE.fetch_add(1, Ordering::Relaxed).wrapping_mul(STEP) % SPAN;
-        let data = vec![fill; len + SPAN / size];
+        let data = Buffer::new(len + SPAN / size, fill);
         // What is there or not depends on the address; no value does.
         let from = place.wrapping_sub(data.as_ptr().addr()) % SPAN / size;
         Self { width, height, from, data, home: Weak::new() }
@@ -72,7 +80,7 @@ impl<T: Copy> Image<T> {
 
     fn from_memory(memory: &Memory<T>, width: usize, height: usize, fill: T) -> Self {
         let mut spare = memory.lock().unwrap_or_else(PoisonError::into_inner);
-        let fits = |(from, data): &(usize, Vec<T>)| data.len() >= from + width * height;
+        let fits = |(from, data): &(usize, Buffer<T>)| data.len() >= from + width * height;
         let found = spare.iter().rposition(fits).map(|i| spare.swap_remove(i));
         drop(spare);
         match found {
@@ -95,7 +103,7 @@ impl<T: Copy> Image<T> {
     /// Takes row-major `data`; `None` when its length is not `width * height`.
     pub fn from_vec(width: usize, height: usize, data: Vec<T>) -> Option<Self> {
         let fits = data.len() == width.checked_mul(height)?;
-        fits.then_some(Self { width, height, from: 0, data, home: Weak::new() })
+        fits.then(|| Self { width, height, from: 0, data: data.into(), home: Weak::new() })
     }
 
     /// Width in pixels.
@@ -152,7 +160,7 @@ impl<T: Copy> Image<T> {
 
     /// The pixels, row-major.
     pub fn into_vec(mut self) -> Vec<T> {
-        let mut data = std::mem::take(&mut self.data);
+        let mut data = std::mem::take(&mut self.data).into_vec();
         data.truncate(self.from + self.width * self.height);
         data.drain(..self.from);
         data
@@ -160,8 +168,14 @@ impl<T: Copy> Image<T> {
 
     /// Applies `f` to every pixel.
     pub fn map<U>(&self, f: impl FnMut(T) -> U) -> Image<U> {
-        let data = self.as_slice().iter().copied().map(f).collect();
-        Image { width: self.width, height: self.height, from: 0, data, home: Weak::new() }
+        let data: Vec<U> = self.as_slice().iter().copied().map(f).collect();
+        Image {
+            width: self.width,
+            height: self.height,
+            from: 0,
+            data: data.into(),
+            home: Weak::new(),
+        }
     }
 }
 
@@ -169,7 +183,7 @@ impl<T: Copy> Clone for Image<T> {
     fn clone(&self) -> Self {
         let Some(&first) = self.as_slice().first() else {
             let (width, height) = (self.width, self.height);
-            return Self { width, height, from: 0, data: Vec::new(), home: Weak::new() };
+            return Self { width, height, from: 0, data: Buffer::default(), home: Weak::new() };
         };
         let mut copy = Self::new(self.width, self.height, first);
         copy.as_mut_slice().copy_from_slice(self.as_slice());

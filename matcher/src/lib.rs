@@ -21,6 +21,7 @@ mod lanes;
 pub mod level;
 pub mod machine;
 pub mod matched;
+mod memory;
 pub mod parabola;
 pub mod parallel;
 pub mod params;

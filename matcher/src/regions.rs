@@ -41,8 +41,21 @@ const BAND: usize = 64;
 #[derive(Debug)]
 pub struct Regions {
     level: Level,
-    /// What each pixel is in its row.
+    bands: Vec<Band>,
+    all: Runs,
+}
+
+/// A band of rows by itself.
+#[derive(Debug, Default)]
+struct Band {
+    /// What each pixel of the row in work is.
     flags: Vec<u8>,
+    found: Runs,
+}
+
+/// Runs of some rows.
+#[derive(Debug, Default)]
+struct Runs {
     runs: Vec<Run>,
     /// First run of each row, and the end.
     rows: Vec<u32>,
@@ -65,54 +78,71 @@ impl Default for Regions {
 impl Regions {
     /// Without memory yet.
     pub fn new(level: Level) -> Self {
-        Self { level: level.usable(), flags: Vec::new(), runs: Vec::new(), rows: Vec::new() }
+        Self { level: level.usable(), bands: Vec::new(), all: Runs::default() }
     }
 
     /// Sets regions of fewer than `least` pixels to NaN.
     pub fn remove(&mut self, map: &mut Image<f32>, least: usize) {
-        let (width, height) = (map.width(), map.height());
-        self.runs.clear();
-        self.rows.clear();
-        self.flags.resize(width * height, NONE);
-        let level = self.level;
-        let bands = self.flags.par_chunks_mut((width * BAND).max(1)).enumerate();
-        bands.share(|(band, flags)| {
-            for (k, flags) in flags.chunks_mut(width).enumerate() {
-                flag_row(level, map.row(band * BAND + k), flags);
+        let (level, height) = (self.level, map.height());
+        let count = height.div_ceil(BAND);
+        self.bands.resize_with(count.max(self.bands.len()), Band::default);
+        let whole = &*map;
+        self.bands[..count].par_iter_mut().enumerate().share(|(band, Band { flags, found })| {
+            flags.resize(whole.width(), NONE);
+            found.clear();
+            let top = band * BAND;
+            for y in top..(top + BAND).min(height) {
+                flag_row(level, whole.row(y), flags);
+                cut(flags, &mut found.runs);
+                found.rows.push(found.runs.len() as u32);
+                if y > top {
+                    found.join(whole, y, y - top);
+                }
             }
         });
-        for y in 0..height {
-            self.rows.push(self.runs.len() as u32);
-            cut(&self.flags[y * width..][..width], &mut self.runs);
-            if y > 0 {
-                self.join(map, y);
+        let all = &mut self.all;
+        all.clear();
+        for (band, Band { found, .. }) in self.bands[..count].iter().enumerate() {
+            let before = all.runs.len() as u32;
+            let moved = |run: &Run| Run { parent: run.parent + before, ..*run };
+            all.runs.extend(found.runs.iter().map(moved));
+            all.rows.extend(found.rows[1..].iter().map(|end| end + before));
+            if band > 0 {
+                all.join(map, band * BAND, band * BAND);
             }
         }
-        self.rows.push(self.runs.len() as u32);
-        for run in 0..self.runs.len() {
-            let root = self.root(run as u32);
+        for run in 0..all.runs.len() {
+            let root = all.root(run as u32);
             if root as usize != run {
-                self.runs[root as usize].size += self.runs[run].to - self.runs[run].from;
+                all.runs[root as usize].size += all.runs[run].to - all.runs[run].from;
             }
         }
         for y in 0..height {
-            for run in self.rows[y]..self.rows[y + 1] {
-                let root = self.root(run);
-                if (self.runs[root as usize].size as usize) < least {
-                    let Run { from, to, .. } = self.runs[run as usize];
+            for run in all.rows[y]..all.rows[y + 1] {
+                let root = all.root(run);
+                if (all.runs[root as usize].size as usize) < least {
+                    let Run { from, to, .. } = all.runs[run as usize];
                     map.row_mut(y)[from as usize..to as usize].fill(f32::NAN);
                 }
             }
         }
     }
+}
 
-    /// Joins the runs of row `y` with those above.
-    fn join(&mut self, map: &Image<f32>, y: usize) {
-        let (above, row) = (map.row(y - 1), map.row(y));
+impl Runs {
+    /// Takes all rows away.
+    fn clear(&mut self) {
+        self.runs.clear();
+        self.rows.clear();
+        self.rows.push(0);
+    }
+
+    /// Joins the runs of the map's row `y`, the `row`th here, with those above.
+    fn join(&mut self, map: &Image<f32>, y: usize, row: usize) {
+        let [up, middle, end] = [row - 1, row, row + 1].map(|row| self.rows[row] as usize);
+        let (above, line) = (map.row(y - 1), map.row(y));
         let at = |x: usize, y: usize| map.get(x, y).unwrap_or(f32::NAN);
-        let mut up = self.rows[y - 1] as usize;
-        let (mut down, middle, end) =
-            (self.rows[y] as usize, self.rows[y] as usize, self.runs.len());
+        let (mut up, mut down) = (up, middle);
         while up < middle && down < end {
             let (a, b) = (self.runs[up], self.runs[down]);
             let (from, to) = (a.from.max(b.from), a.to.min(b.to));
@@ -120,7 +150,7 @@ impl Regions {
                 let (ra, rb) = (self.root(up as u32), self.root(down as u32));
                 let touch = |x: u32| {
                     let x = x as usize;
-                    joined(at(x, y.wrapping_sub(2)), above[x], row[x], at(x, y + 1))
+                    joined(at(x, y.wrapping_sub(2)), above[x], line[x], at(x, y + 1))
                 };
                 if ra != rb && (from..to).any(touch) {
                     let (low, high) = (ra.min(rb), ra.max(rb));

@@ -39,12 +39,18 @@ pub(super) struct Warp {
 }
 
 /// Working memory of a warp; any number of warps of any size can share one.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct RectifyScratch {
     /// The picture between the passes: raw rows, padded above and below, by canvas columns.
-    between: Vec<i16>,
+    between: Image<i16>,
     /// A raw row per band.
     lines: Vec<i16>,
+}
+
+impl Default for RectifyScratch {
+    fn default() -> Self {
+        Self { between: Image::new(0, 0, 0), lines: Vec::new() }
+    }
 }
 
 /// A virtual camera: where canvas pixels are on the real one.
@@ -130,12 +136,14 @@ impl Warp {
         let ([raw_w, raw_h], [w, _]) = (self.raw_px, self.canvas_px);
         let stride = w.next_multiple_of(BLOCK);
         let line_len = raw_w + TAPS;
-        scratch.between.resize(stride * (raw_h + TAPS), 0);
+        if (scratch.between.width(), scratch.between.height()) != (stride, raw_h + TAPS) {
+            scratch.between = Image::new(stride, raw_h + TAPS, 0);
+        }
         scratch.lines.resize(line_len * raw_h.div_ceil(BAND), 0);
         let bits = u32::from(raw.bits.clamp(1, 16));
         let (taps, shift) = self.taps.camera_taps(bits);
         let lines = Lines { raw, width: raw_w, halve: bits == 16 };
-        let inner = &mut scratch.between[TAPS_BEFORE * stride..][..raw_h * stride];
+        let inner = &mut scratch.between.as_mut_slice()[TAPS_BEFORE * stride..][..raw_h * stride];
         inner
             .par_chunks_mut(stride * BAND)
             .zip(scratch.lines.par_chunks_mut(line_len))
@@ -148,7 +156,7 @@ impl Warp {
                 }
             });
         // Beyond its ends, the first and the last row repeat.
-        let between = &mut scratch.between;
+        let between = scratch.between.as_mut_slice();
         let end = TAPS_BEFORE + raw_h;
         for y in 0..TAPS_BEFORE {
             between.copy_within(TAPS_BEFORE * stride..(TAPS_BEFORE + 1) * stride, y * stride);

@@ -31,6 +31,8 @@ const OWN_SIMILARITY_MIN: f32 = 0.75;
 const OWN_LOSS: f32 = 8.0;
 /// Pixels from one ZNCC that the median looks at to the next.
 const SAMPLE: usize = 97;
+/// Samples of a task.
+const SAMPLES: usize = 256;
 
 /// Settles depth steps; keeps its buffers between frames.
 #[derive(Debug)]
@@ -134,9 +136,14 @@ impl Settle {
 
     /// The least similarity that a single pixel needs, by the noise of the whole image.
     fn own_similarity_min(&mut self, zncc: &Image<f32>) -> f32 {
-        let known = zncc.as_slice().iter().step_by(SAMPLE).filter(|z| !z.is_nan());
-        self.losses.clear();
-        self.losses.extend(known.map(|z| 1.0 - z));
+        let zncc = zncc.as_slice();
+        self.losses.resize(zncc.len().div_ceil(SAMPLE), 0.0);
+        // Each is a line from memory.
+        self.losses.par_chunks_mut(SAMPLES).enumerate().share(|(k, losses)| {
+            let from = zncc[k * SAMPLES * SAMPLE..].iter().step_by(SAMPLE);
+            losses.iter_mut().zip(from).for_each(|(loss, z)| *loss = 1.0 - z);
+        });
+        self.losses.retain(|loss| !loss.is_nan());
         let middle = self.losses.len() / 2;
         if self.losses.is_empty() {
             return OWN_SIMILARITY_MIN;
@@ -148,15 +155,16 @@ impl Settle {
     /// Marks the blocks that hold a step, and the blocks around.
     fn mark_blocks(&mut self, step: &Image<u8>) {
         let (columns, rows) = (self.blocks.width(), self.blocks.height());
-        self.around.as_mut_slice().fill(false);
-        for row in 0..rows {
-            let set = self.blocks.row_mut(row);
+        self.blocks.as_mut_slice().par_chunks_mut(columns).enumerate().share(|(row, set)| {
             set.fill(false);
             for y in row * BLOCK..((row + 1) * BLOCK).min(step.height()) {
                 for (set, marks) in set.iter_mut().zip(step.row(y).chunks(BLOCK)) {
                     *set |= marks.iter().fold(0, |any, mark| any | mark) != 0;
                 }
             }
+        });
+        self.around.as_mut_slice().fill(false);
+        for row in 0..rows {
             for column in (0..columns).filter(|&column| self.blocks.row(row)[column]) {
                 for y in row.saturating_sub(1)..(row + 2).min(rows) {
                     let across = column.saturating_sub(1)..(column + 2).min(columns);

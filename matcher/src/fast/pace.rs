@@ -4,9 +4,12 @@
 //! descriptors no longer match and rates converge to wrong values. Of half the frames it travels less
 //! than half as far. Both tests look at one stack alone, so that no result depends on an earlier one.
 
+use rayon::prelude::*;
+
 use crate::{
     DisparityRange, Image, Level, Sample, StereoStack,
     coarse::{Coarse, CoarseMap, INVALID, is_dark},
+    parallel::Share,
 };
 
 /// Travel over the frames, in px, from which on fewer frames are matched.
@@ -92,15 +95,17 @@ impl Trial {
         let lit = |y: usize, x: usize| !is_dark(stack.left, x, y);
         self.bands.clear();
         self.bands.resize(height.div_ceil(BAND), (0, 0));
-        for y in (GRID / 2..height).step_by(GRID) {
-            let (seen, found) = &mut self.bands[y / BAND];
-            for x in (GRID / 2..width).step_by(GRID) {
-                // What is found is lit: the images are looked at only where nothing is.
-                let here = !disparity.row(y)[x].is_nan();
-                *found += usize::from(here);
-                *seen += usize::from(here || lit(y, x));
+        self.bands.par_iter_mut().enumerate().share(|(band, (seen, found))| {
+            let rows = band * BAND..((band + 1) * BAND).min(height);
+            for y in rows.skip(GRID / 2).step_by(GRID) {
+                for x in (GRID / 2..width).step_by(GRID) {
+                    // What is found is lit: the images are looked at only where nothing is.
+                    let here = !disparity.row(y)[x].is_nan();
+                    *found += usize::from(here);
+                    *seen += usize::from(here || lit(y, x));
+                }
             }
-        }
+        });
         let sum =
             |of: fn(&(usize, usize)) -> usize| self.bands.iter().map(of).sum::<usize>() as f32;
         let (seen, found) = (sum(|b| b.0), sum(|b| b.1));

@@ -110,6 +110,8 @@ pub struct StepJudge {
     /// Pixels to judge in a pass, and what takes their disparity's place.
     open: Vec<u32>,
     proposals: Vec<Option<Option<f32>>>,
+    /// Which of those that may be open are beside a step or a gap.
+    bare: Vec<bool>,
     changed: Vec<u32>,
     columns: PerThread<Vec<u8>>,
 }
@@ -125,6 +127,7 @@ impl StepJudge {
             beside: none(),
             open: Vec::new(),
             proposals: Vec::new(),
+            bare: Vec::new(),
             changed: Vec::new(),
             columns: PerThread::default(),
         }
@@ -212,21 +215,29 @@ impl StepJudge {
             // What the changed pixels hid is beside a step or a gap now.
             for &i in &self.changed[first..] {
                 let (x, y) = (i as usize % width, i as usize / width);
-                for (nx, ny) in around(x, y, width, height) {
-                    let n = ny * width + nx;
-                    if self.beside.as_slice()[n] != CHANGED
-                        && is_beside(stack, disparity_px, nx, ny)
-                    {
-                        self.beside.as_mut_slice()[n] = BESIDE;
-                        self.open.push(n as u32);
-                    }
+                let near = around(x, y, width, height).map(|(nx, ny)| ny * width + nx);
+                let near = near.filter(|&n| self.beside.as_slice()[n] != CHANGED);
+                self.open.extend(near.map(|n| n as u32));
+            }
+            self.open.sort_unstable();
+            self.open.dedup();
+            self.bare.resize(self.open.len(), false);
+            let parts = self.open.par_chunks(TASK).zip(self.bare.par_chunks_mut(TASK));
+            let map = &*disparity_px;
+            parts.share(|(open, bare)| {
+                for (&i, bare) in open.iter().zip(bare) {
+                    let (x, y) = (i as usize % width, i as usize / width);
+                    *bare = is_beside(stack, map, x, y);
                 }
+            });
+            let mut bare = self.bare.iter();
+            self.open.retain(|_| bare.next().copied().unwrap_or(false));
+            for &i in &self.open {
+                self.beside.as_mut_slice()[i as usize] = BESIDE;
             }
             if self.open.is_empty() {
                 break;
             }
-            self.open.sort_unstable();
-            self.open.dedup();
         }
         self.changed.sort_unstable();
         &self.changed

@@ -10,7 +10,7 @@ mod avx2;
 #[cfg(target_arch = "aarch64")]
 mod neon;
 
-use stspp_matcher::Level;
+use stspp_matcher::{Image, Level};
 
 use super::kernel::{PHASE_BITS, PHASES, TAPS};
 
@@ -33,7 +33,8 @@ pub(super) struct Places {
     /// Blocks of a row.
     per_row: usize,
     blocks: Vec<Block>,
-    offsets: Vec<u16>,
+    /// By rows of whole blocks.
+    offsets: Image<u16>,
     /// Samples that a line must have: no tap reaches farther.
     reach: usize,
 }
@@ -68,6 +69,9 @@ impl Places {
                 reach = reach.max((first + span) as usize + TAPS);
             }
         }
+        let offsets = Image::from_vec(per_row * BLOCK, rows, offsets);
+        // Copied into memory of its own kind, which large images are in.
+        let offsets = offsets.map_or_else(|| Image::new(0, 0, 0), |image| image.clone());
         Self { per_row, blocks, offsets, reach }
     }
 
@@ -75,7 +79,7 @@ impl Places {
     pub fn row(&self, y: usize) -> Row<'_> {
         Row {
             blocks: &self.blocks[y * self.per_row..][..self.per_row],
-            offsets: &self.offsets[y * self.per_row * BLOCK..][..self.per_row * BLOCK],
+            offsets: self.offsets.row(y),
             reach: self.reach,
         }
     }
