@@ -54,7 +54,7 @@ pub use frame::{DepthFrame, PointCloud, SlotLabel};
 pub use geometry::RectifiedGeometry;
 pub use raw::RawImage;
 pub use recording::Recording;
-pub use rectify::{DepthRange, Rectifier};
+pub use rectify::{Canvas, DepthRange, Rectifier};
 
 pub use error::Error;
 pub use pipeline::{

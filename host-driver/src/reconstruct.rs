@@ -10,8 +10,8 @@ use stspp_matcher::{
 
 use crate::cpu_time::{Step, Stopwatch};
 use crate::recording::{Recording, RecordingError, StereoPair};
-use crate::rectify::{DepthRange, Rectifier, RectifyError, RectifyScratch};
-use crate::{DepthFrame, SlotLabel, reproject};
+use crate::rectify::{Canvas, DepthRange, Rectifier, RectifyError, RectifyScratch};
+use crate::{DepthFrame, SlotLabel, StereoCalibration, reproject};
 
 /// Most frames that the matcher takes.
 pub const FRAMES_MAX: usize = 16;
@@ -23,6 +23,8 @@ pub const FRAMES_DEFAULT: usize = 10;
 pub struct Options {
     /// Depths that are measured.
     pub depth: DepthRange,
+    /// Size of the rectified images.
+    pub canvas: Canvas,
     /// How the sub-pixel disparity is found.
     pub method: Method,
     /// Order of the shape function.
@@ -36,6 +38,26 @@ pub struct Options {
     /// Whether the dense method takes depth steps as the coarse search places them, instead of letting
     /// the pixels' own grey values decide.
     pub keep_steps: bool,
+}
+
+impl Options {
+    /// The rectification of a sensor's images.
+    ///
+    /// # Errors
+    /// As [`Rectifier::new`].
+    pub fn rectifier(&self, calibration: &StereoCalibration) -> Result<Rectifier, RectifyError> {
+        Rectifier::with_canvas(calibration, self.depth, self.canvas)
+    }
+
+    /// The matcher's parameters for images rectified so.
+    pub fn params(&self, rectifier: &Rectifier) -> Params {
+        let mut params = Params::new(rectifier.disparity_range());
+        params.method = self.method;
+        params.shape = self.shape;
+        params.advanced.threads = self.threads;
+        params.advanced.settle_steps = !self.keep_steps;
+        params
+    }
 }
 
 /// Why a recording has no depth.
@@ -204,19 +226,14 @@ pub fn reconstruct(
     watch.step("read");
 
     progress("rectifying");
-    let rectifier = Rectifier::new(&recording.calibration, options.depth)?;
+    let rectifier = options.rectifier(&recording.calibration)?;
     watch.step("rectification maps");
     let stack = RectifiedStack::new(rectifier, &raw, window.labels)?;
     drop(raw);
     watch.step("rectify");
 
     progress("matching");
-    let mut params = Params::new(stack.rectifier.disparity_range());
-    params.method = options.method;
-    params.shape = options.shape;
-    params.advanced.threads = options.threads;
-    params.advanced.settle_steps = !options.keep_steps;
-    let mut matcher = Matcher::new(params)?;
+    let mut matcher = Matcher::new(options.params(&stack.rectifier))?;
     let mut matched = stack.matched(&mut matcher, 0..stack.len())?;
     watch.step("match");
 

@@ -4,7 +4,7 @@ mod common;
 
 use common::{Random, inside, raw_pixel, rig, undistorted};
 use nalgebra::{Point3, Vector3};
-use stspp::rectify::{DepthRange, Kernel, Rectifier, RectifyScratch};
+use stspp::rectify::{Canvas, DepthRange, Kernel, Rectifier, RectifyScratch};
 use stspp::{RawImage, RectifiedGeometry, StereoCalibration};
 use stspp_matcher::Image;
 
@@ -103,6 +103,29 @@ fn no_pixel_that_both_cameras_see_is_lost() {
     assert!(at_border > 20, "the sample must reach the border");
     // And the canvases are not much larger than the images.
     assert!(geometry.width < 1400 && geometry.height < 1150, "{geometry:?}");
+}
+
+#[test]
+fn the_sensors_own_size_is_the_middle_of_the_whole() {
+    let (calibration, depth) = (rig(), DepthRange::default());
+    let whole = Rectifier::new(&calibration, depth).unwrap();
+    let part = Rectifier::with_canvas(&calibration, depth, Canvas::Sensor).unwrap();
+    let (a, b) = (whole.geometry(), part.geometry());
+    assert_eq!([b.width, b.height], calibration.left.resolution_px);
+    let [dx, dy] = [a.cx_left_px - b.cx_left_px, a.cy_px - b.cy_px];
+    // Margins are equal but for the columns that make rows of whole vectors.
+    assert!((dx - 0.5 * (a.width - b.width) as f64).abs() <= 17.0, "{dx}");
+    assert!((dy - 0.5 * (a.height - b.height) as f64).abs() <= 2.0, "{dy}");
+    let dots = raw_dots(&Dots::new(1.0));
+    let mut scratch = RectifyScratch::default();
+    let (mut all, mut some) = (whole.canvas(), part.canvas());
+    whole.rectify_left(&dots, &mut all, &mut scratch).unwrap();
+    part.rectify_left(&dots, &mut some, &mut scratch).unwrap();
+    let at = |y: usize| &all.row(y + dy as usize)[dx as usize..][..b.width];
+    assert!((0..b.height).all(|y| some.row(y) == at(y)));
+    let p = Point3::new(0.02, -0.03, 0.9);
+    let ((x, y, d), (u, v, e)) = (a.project_left_m(&p).unwrap(), b.project_left_m(&p).unwrap());
+    assert!((x - dx - u).abs() + (y - dy - v).abs() + (d - e).abs() < 1e-9);
 }
 
 #[test]

@@ -82,12 +82,8 @@ pub(crate) struct DepthEngine {
 
 impl DepthEngine {
     pub fn new(calibration: &StereoCalibration, options: &Options) -> Result<Self, Error> {
-        let rectifier = Rectifier::new(calibration, options.depth)?;
-        let mut params = Params::new(rectifier.disparity_range());
-        params.method = options.method;
-        params.shape = options.shape;
-        params.advanced.threads = options.threads;
-        params.advanced.settle_steps = !options.keep_steps;
+        let rectifier = options.rectifier(calibration)?;
+        let params = options.params(&rectifier);
         if let Some(frames) = options.frames.filter(|frames| !(1..=FRAMES_MAX).contains(frames)) {
             return Err(stspp_matcher::Error::FrameCount { frames }.into());
         }

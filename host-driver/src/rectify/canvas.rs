@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Point3, Rotation3, Vector2, Vector3};
 
-use super::{DepthRange, RectifyError};
+use super::{Canvas, DepthRange, RectifyError};
 use crate::{CameraIntrinsics, RectifiedGeometry, StereoCalibration};
 
 /// Raw pixels between samples of the image area, for averages and bounds.
@@ -142,6 +142,7 @@ fn focal_px(views: [&View<'_>; 2]) -> Result<f64, RectifyError> {
 pub(super) fn choose(
     calibration: &StereoCalibration,
     depth: &DepthRange,
+    canvas: Canvas,
 ) -> Result<RectifiedGeometry, RectifyError> {
     let rect_from_left = rect_from_left(calibration)?;
     let left_from_right = calibration.right_from_left.rotation.inverse().to_rotation_matrix();
@@ -172,7 +173,7 @@ pub(super) fn choose(
         let middle = 0.5 * (bounds.min.x + bounds.max.x) * focal_px;
         (0.5 * (width - 1.0) - middle).round()
     };
-    Ok(RectifiedGeometry {
+    let mut geometry = RectifiedGeometry {
         rect_from_left,
         focal_px,
         cx_left_px: centred(&in_left),
@@ -182,5 +183,14 @@ pub(super) fn choose(
         // Rows of whole vectors are read faster; the columns added show nothing.
         width: (width as usize + 1).next_multiple_of(ROW_PX),
         height: height as usize + 1,
-    })
+    };
+    if canvas == Canvas::Sensor {
+        let [w, h] = calibration.left.resolution_px;
+        let beside = (0.5 * (width - w as f64)).round();
+        geometry.cx_left_px -= beside;
+        geometry.cx_right_px -= beside;
+        geometry.cy_px -= (0.5 * (height - h as f64)).round();
+        (geometry.width, geometry.height) = (w, h);
+    }
+    Ok(geometry)
 }

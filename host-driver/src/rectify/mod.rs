@@ -36,6 +36,17 @@ impl Default for DepthRange {
     }
 }
 
+/// Size of the rectified images.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Canvas {
+    /// All that both cameras see within the depth range: some pixels more than the cameras have.
+    #[default]
+    Whole,
+    /// The middle of that, in the cameras' own size: a margin of some pixels is lost, and a frame takes
+    /// that much less time.
+    Sensor,
+}
+
 /// Why images cannot be rectified.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -98,6 +109,18 @@ impl Rectifier {
         Self::with_kernel(calibration, depth, Kernel::default())
     }
 
+    /// As [`Self::new`] with canvases of another size.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_canvas(
+        calibration: &StereoCalibration,
+        depth: DepthRange,
+        canvas: Canvas,
+    ) -> Result<Self, RectifyError> {
+        Self::build(calibration, depth, Kernel::default(), canvas)
+    }
+
     /// As [`Self::new`] with another interpolation kernel.
     ///
     /// # Errors
@@ -107,13 +130,22 @@ impl Rectifier {
         depth: DepthRange,
         kernel: Kernel,
     ) -> Result<Self, RectifyError> {
+        Self::build(calibration, depth, kernel, Canvas::default())
+    }
+
+    fn build(
+        calibration: &StereoCalibration,
+        depth: DepthRange,
+        kernel: Kernel,
+        canvas: Canvas,
+    ) -> Result<Self, RectifyError> {
         let DepthRange { min_m, max_m } = depth;
         if !(0.0 < min_m && min_m < max_m && max_m <= 1000.0) {
             return Err(RectifyError::DepthRange { min_m, max_m });
         }
         calibration.validate()?;
         let wide = DepthRange { min_m: min_m * NEAR_MARGIN, max_m: max_m * FAR_MARGIN };
-        let geometry = canvas::choose(calibration, &wide)?;
+        let geometry = canvas::choose(calibration, &wide, canvas)?;
         let disparity = geometry
             .disparity_range(wide.min_m, wide.max_m)
             .ok_or(RectifyError::DepthRange { min_m, max_m })?;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::ValueEnum;
 use stspp::export::{folder::OutputError, folder::OutputFolder, outputs};
 use stspp::reconstruct::{Options, ReconstructError};
-use stspp::rectify::{DepthRange, RectifyError};
+use stspp::rectify::{Canvas, DepthRange, RectifyError};
 use stspp::{Recording, reconstruct, report};
 use stspp_matcher::{Method, ShapeFunction};
 
@@ -57,6 +57,9 @@ pub struct Matching {
     /// Farthest depth in metres.
     #[arg(long, default_value_t = 2.0, value_name = "M")]
     pub depth_max: f64,
+    /// Size of the rectified images.
+    #[arg(long, value_enum, default_value_t)]
+    pub canvas: CanvasName,
     /// Threads to use [default: all cores].
     #[arg(long)]
     pub threads: Option<usize>,
@@ -92,6 +95,26 @@ pub enum OrderName {
     Auto,
 }
 
+/// Names of [`Canvas`].
+#[derive(ValueEnum, Clone, Copy, Default)]
+pub enum CanvasName {
+    /// All that both cameras see within the depth range.
+    #[default]
+    Whole,
+    /// The cameras' own size: loses a margin of some pixels, and saves that much time.
+    Sensor,
+}
+
+impl CanvasName {
+    /// The library's size.
+    pub fn canvas(self) -> Canvas {
+        match self {
+            Self::Whole => Canvas::Whole,
+            Self::Sensor => Canvas::Sensor,
+        }
+    }
+}
+
 impl MethodName {
     /// The library's method.
     pub fn method(self) -> Method {
@@ -119,6 +142,7 @@ impl Matching {
     pub fn options(&self) -> Options {
         Options {
             depth: DepthRange { min_m: self.depth_min, max_m: self.depth_max },
+            canvas: self.canvas.canvas(),
             method: self.method.method(),
             shape: self.order.shape(),
             frames: self.frames,
