@@ -10,6 +10,8 @@ const BAND: usize = 32;
 const STRIP: usize = 512;
 /// Pixels whose window's range is found together, where there is a jump at all.
 const BLOCK: usize = 32;
+/// Columns whose extremes are found together: a register.
+const LANES: usize = 16;
 /// Most rows of a window.
 const ROWS: usize = 2 * RADIUS_LIMIT + 1;
 /// Columns of a strip and what its windows reach.
@@ -172,25 +174,56 @@ fn mark_loop(
         let mut high = [f32::NEG_INFINITY; BLOCK + 2 * RADIUS_LIMIT];
         let first = (x0 + from).saturating_sub(radius);
         let before = radius - (x0 + from - first);
-        for row in rows {
-            let row = &row[first..(x0 + from + BLOCK + radius).min(row.len())];
-            let extremes = low[before..].iter_mut().zip(&mut high[before..]);
-            for ((lo, hi), &v) in extremes.zip(row) {
-                // NaN loses either comparison.
-                *lo = if v < *lo { v } else { *lo };
-                *hi = if v > *hi { v } else { *hi };
-            }
+        let columns = first..(x0 + from + BLOCK + radius).min(rows[0].len());
+        let (low_of, high_of) = (&mut low[before..], &mut high[before..]);
+        let (low_of, high_of) = (&mut low_of[..columns.len()], &mut high_of[..columns.len()]);
+        let parts = low_of.chunks_mut(LANES).zip(high_of.chunks_mut(LANES));
+        for (k, (low, high)) in parts.enumerate() {
+            column_extremes(rows, columns.start + k * LANES, low, high);
         }
         let mut far = [0u8; BLOCK];
-        for j in 0..2 * radius + 1 {
-            let window = low[j..j + BLOCK].iter().zip(&high[j..j + BLOCK]);
-            for ((far, own), (lo, hi)) in far.iter_mut().zip(&own[from..]).zip(window) {
-                *far |= u8::from(own - lo > limit) | u8::from(hi - own > limit);
+        for (k, far) in far.chunks_mut(LANES).enumerate() {
+            let (mut lo, mut hi) = ([f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]);
+            for j in 0..2 * radius + 1 {
+                widen(&low[k * LANES + j..], &high[k * LANES + j..], &mut lo, &mut hi);
+            }
+            let own = own[from..].iter().skip(k * LANES);
+            for ((far, own), (lo, hi)) in far.iter_mut().zip(own).zip(lo.iter().zip(&hi)) {
+                *far = u8::from(own - lo > limit) | u8::from(hi - own > limit);
             }
         }
         for (mark, far) in marks.iter_mut().zip(far) {
             *mark = u8::from(*mark != 0) & far;
         }
+    }
+}
+
+/// The lowest and highest of all `rows` in the columns from `at` on.
+#[inline(always)]
+fn column_extremes(rows: &[&[f32]], at: usize, low: &mut [f32], high: &mut [f32]) {
+    // In arrays of known length, which stay in registers from row to row.
+    let (mut lo, mut hi) = ([f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]);
+    for row in rows {
+        match row[at..].first_chunk::<LANES>() {
+            Some(values) => widen(values, values, &mut lo, &mut hi),
+            None => {
+                let mut values = [f32::NAN; LANES];
+                values[..row.len() - at].copy_from_slice(&row[at..]);
+                widen(&values, &values, &mut lo, &mut hi);
+            }
+        }
+    }
+    low.copy_from_slice(&lo[..low.len()]);
+    high.copy_from_slice(&hi[..high.len()]);
+}
+
+/// Widens ranges by the first values of `low` and `high`; NaN loses either comparison.
+#[inline(always)]
+fn widen(low: &[f32], high: &[f32], lo: &mut [f32; LANES], hi: &mut [f32; LANES]) {
+    let (low, high) = (&low[..LANES], &high[..LANES]);
+    for i in 0..LANES {
+        lo[i] = if low[i] < lo[i] { low[i] } else { lo[i] };
+        hi[i] = if high[i] > hi[i] { high[i] } else { hi[i] };
     }
 }
 
