@@ -15,6 +15,8 @@ pub mod cpu_time;
 pub mod dense;
 pub mod error;
 mod fast;
+#[cfg(test)]
+mod guarded;
 pub mod icgn;
 pub mod image;
 mod lanes;

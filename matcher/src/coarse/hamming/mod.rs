@@ -132,7 +132,10 @@ pub(crate) fn untaken(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::Random;
+    use crate::{
+        guarded::{Edge, Guarded},
+        synthetic::Random,
+    };
 
     #[test]
     fn levels_are_bit_equal() {
@@ -151,9 +154,10 @@ mod tests {
                 let mut want = vec![9; n];
                 scalar::search(&left, &right, 250, &shifts.0, &mut want);
                 for level in Level::available() {
-                    let mut got = vec![9; n];
+                    let left = Guarded::new(&left, Edge::End);
+                    let mut got = Guarded::new(&vec![9; n], Edge::End);
                     best_candidates(level, &left, &right, 250, &shifts, &mut got);
-                    assert_eq!(got, want, "{level} {n} {count}");
+                    assert_eq!(got[..], want[..], "{level} {n} {count}");
                 }
             }
         }
@@ -180,8 +184,9 @@ mod tests {
                 (0..n).map(|_| value ^ (random.bits() & random.bits() & random.bits())).collect();
             let distances = row.iter().map(|r| (r ^ value).count_ones());
             let want = distances.enumerate().map(|(i, d)| (d, i)).min();
-            for level in Level::available() {
-                assert_eq!(nearest(level, value, &row), want, "{level} {n}");
+            for (level, edge) in Level::available().flat_map(|l| Edge::BOTH.map(|e| (l, e))) {
+                let got = nearest(level, value, &Guarded::new(&row, edge));
+                assert_eq!(got, want, "{level} {n}");
             }
         }
     }
@@ -196,7 +201,8 @@ mod tests {
                     (0..n).map(|_| u8::from(!random.bits().is_multiple_of(one_in))).collect();
                 let want: Vec<(u64, u16)> =
                     (0..n).filter(|i| taken[*i] == 0).map(|i| (row[i], i as u16)).collect();
-                for level in Level::available() {
+                for (level, edge) in Level::available().flat_map(|l| Edge::BOTH.map(|e| (l, e))) {
+                    let (taken, row) = (Guarded::new(&taken, edge), Guarded::new(&row, edge));
                     let (mut descriptors, mut columns) = (Vec::new(), Vec::new());
                     let n = untaken(level, &taken, &row, &mut descriptors, &mut columns);
                     let got: Vec<(u64, u16)> =

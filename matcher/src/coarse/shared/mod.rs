@@ -84,7 +84,11 @@ pub(super) fn take(level: Level, disparity: &[i16], cost: &[u8], most: u8, taken
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{coarse::INVALID, synthetic::Random};
+    use crate::{
+        coarse::INVALID,
+        guarded::{Edge, Guarded},
+        synthetic::Random,
+    };
 
     /// Blocks of one disparity, of some, of many and of none.
     #[test]
@@ -110,16 +114,17 @@ mod tests {
                 scalar::keep(0, &want, 2, &mut want_kept);
                 let mut want_taken = vec![0; n + 2 * BLOCK];
                 scalar::take(0, &disparity, &cost, 9, &mut want_taken);
-                for level in Level::available() {
-                    let mut claims = vec![u32::MAX; n + 2 * BLOCK];
-                    claim(level, &disparity, &cost, &mut claims);
-                    assert_eq!(claims, want, "{level} {n} {spread}");
-                    let mut kept = disparity.clone();
+                for (level, edge) in Level::available().flat_map(|l| Edge::BOTH.map(|e| (l, e))) {
+                    let cost = Guarded::new(&cost, edge);
+                    let mut claims = Guarded::new(&vec![u32::MAX; n + 2 * BLOCK], edge);
+                    let mut kept = Guarded::new(&disparity, edge);
+                    claim(level, &kept, &cost, &mut claims);
+                    assert_eq!(claims[..], want[..], "{level} {n} {spread}");
+                    let mut taken = Guarded::new(&vec![0; n + 2 * BLOCK], edge);
+                    take(level, &kept, &cost, 9, &mut taken);
+                    assert_eq!(taken[..], want_taken[..], "{level} {n} {spread}");
                     keep(level, &claims, 2, &mut kept);
-                    assert_eq!(kept, want_kept, "{level} {n} {spread}");
-                    let mut taken = vec![0; n + 2 * BLOCK];
-                    take(level, &disparity, &cost, 9, &mut taken);
-                    assert_eq!(taken, want_taken, "{level} {n} {spread}");
+                    assert_eq!(kept[..], want_kept[..], "{level} {n} {spread}");
                 }
             }
         }

@@ -108,19 +108,25 @@ pub(crate) fn static_row(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::Random;
+    use crate::{
+        guarded::{Edge, Guarded},
+        synthetic::Random,
+    };
 
-    type Maps = (Vec<i32>, Vec<i32>, [Vec<f32>; 5]);
+    type Maps = ([Vec<i32>; 2], [Vec<f32>; 5]);
 
-    fn run(level: Level, rows: &[Vec<Sample>], x0: usize, len: usize) -> Maps {
+    fn run(level: Level, rows: &[Vec<Sample>], x0: usize, len: usize, edge: Edge) -> Maps {
+        let rows: Vec<Guarded<Sample>> = rows.iter().map(|r| Guarded::new(r, edge)).collect();
         let left: Vec<&[Sample]> = rows.iter().map(|r| &r[..]).collect();
-        let mut words = (vec![0; rows.len() / 2 * len], vec![0; rows.len() / 2 * len]);
-        let mut maps: [Vec<f32>; 5] = std::array::from_fn(|_| vec![0.0; len]);
+        let none = vec![0; rows.len() / 2 * len];
+        let mut words = [Guarded::new(&none, edge), Guarded::new(&none, edge)];
+        let none = vec![0.0; len];
+        let mut maps: [Guarded<f32>; 5] = std::array::from_fn(|_| Guarded::new(&none, edge));
         let [s, il, i, l, ll] = &mut maps;
-        let (gradient, grey) = (&mut words.0[..], &mut words.1[..]);
+        let [gradient, grey] = &mut words;
         let mut out = Static { gradient, grey, stride: len, s, il, i, l, ll };
         static_row(level, &left, x0, len, &mut out);
-        (words.0, words.1, maps)
+        (words.map(|w| w.to_vec()), maps.map(|m| m.to_vec()))
     }
 
     #[test]
@@ -132,9 +138,10 @@ mod tests {
             let rows: Vec<Vec<Sample>> = (0..6)
                 .map(|_| (0..width).map(|_| (random.bits() % 16_321) as i16).collect())
                 .collect();
-            let want = run(Level::Scalar, &rows, x0, len);
-            for level in Level::available() {
-                assert_eq!(run(level, &rows, x0, len), want, "{level} {width} {x0} {len}");
+            let want = run(Level::Scalar, &rows, x0, len, Edge::End);
+            for (level, edge) in Level::available().flat_map(|l| Edge::BOTH.map(|e| (l, e))) {
+                let got = run(level, &rows, x0, len, edge);
+                assert_eq!(got, want, "{level} {edge:?} {width} {x0} {len}");
             }
         }
     }

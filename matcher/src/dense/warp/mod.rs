@@ -108,34 +108,44 @@ fn position(x: usize, w: f32, width: usize) -> Option<(f32, usize, usize)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::Random;
+    use crate::{
+        guarded::{Edge, Guarded},
+        synthetic::Random,
+    };
 
-    fn run(level: Level, right: &[Vec<Sample>], x0: usize, w: &[f32]) -> [Vec<f32>; 7] {
+    fn run(level: Level, right: &[Vec<Sample>], x0: usize, w: &[f32], edge: Edge) -> [Vec<f32>; 7] {
+        let right: Vec<Guarded<Sample>> = right.iter().map(|r| Guarded::new(r, edge)).collect();
         let rows: Vec<&[Sample]> = right.iter().map(|r| &r[..]).collect();
+        let w = &*Guarded::new(w, edge);
         let mut random = Random::new(8);
         let words = rows.len() / 2 * w.len();
         let pair = |r: &mut Random| {
             let half = |r: &mut Random| (r.bits() % 4081) as i32;
             half(r) | (half(r) - 2040) << 16
         };
-        let gradient: Vec<i32> = (0..words).map(|_| pair(&mut random)).collect();
-        let grey: Vec<i32> = (0..words).map(|_| pair(&mut random)).collect();
-        let weighted: Vec<i32> = (0..words).map(|_| pair(&mut random)).collect();
-        let mut maps: [Vec<f32>; 7] = std::array::from_fn(|_| vec![7.0; w.len()]);
+        let mut pairs = || {
+            let pairs: Vec<i32> = (0..words).map(|_| pair(&mut random)).collect();
+            Guarded::new(&pairs, edge)
+        };
+        let (gradient, grey, weighted) = (pairs(), pairs(), pairs());
+        let map = || Guarded::new(&vec![7.0; w.len()], edge);
+        let mut maps: [Guarded<f32>; 7] = std::array::from_fn(|_| map());
         let [at, valid, ig, g, gg, lg, igt] = &mut maps;
         let source =
             Source { right: &rows, x0, w, gradient: &gradient, grey: &grey, stride: w.len() };
         let timed = Some(Timed { gradient: &weighted, ig: igt });
         warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg: Some(lg), timed });
         for with_lg in [false, true] {
-            let mut without: [Vec<f32>; 6] = std::array::from_fn(|_| vec![7.0; w.len()]);
+            let mut without: [Guarded<f32>; 6] = std::array::from_fn(|_| map());
             let [at, valid, ig, g, gg, lg] = &mut without;
             let lg = with_lg.then_some(&mut lg[..]);
             warp_row(level, &source, &mut Warped { at, valid, ig, g, gg, lg, timed: None });
             let count = if with_lg { 6 } else { 5 };
-            assert_eq!(without[..count], maps[..count], "{level}");
+            for (without, map) in without.iter().zip(&maps).take(count) {
+                assert_eq!(without[..], map[..], "{level}");
+            }
         }
-        maps
+        maps.map(|map| map.to_vec())
     }
 
     #[test]
@@ -159,9 +169,10 @@ mod tests {
                 w[3] = f32::NAN;
                 w[5] = f32::INFINITY;
                 w[6] = -1e30;
-                let want = run(Level::Scalar, &rows, x0, &w);
-                for level in Level::available() {
-                    assert_eq!(run(level, &rows, x0, &w), want, "{level} {width} {x0} {len}");
+                let want = run(Level::Scalar, &rows, x0, &w, Edge::End);
+                for (level, edge) in Level::available().flat_map(|l| Edge::BOTH.map(|e| (l, e))) {
+                    let got = run(level, &rows, x0, &w, edge);
+                    assert_eq!(got, want, "{level} {edge:?} {width} {x0} {len}");
                 }
             }
         }
@@ -173,7 +184,7 @@ mod tests {
         let f = |x: f64| 8000.0 + 4000.0 * (0.7 * x).sin();
         let row: Vec<Sample> = (0..80).map(|x| f(x as f64).round() as Sample).collect();
         let w: Vec<f32> = (0..80).map(|x| 0.0625 * (x % 16) as f32).collect();
-        let out = run(Level::Scalar, &[row, vec![0; 80]], 0, &w);
+        let out = run(Level::Scalar, &[row, vec![0; 80]], 0, &w, Edge::End);
         for x in 10..70 {
             let want = f(x as f64 - f64::from(w[x])) / 4.0;
             assert!((f64::from(out[3][x]) - want).abs() < 6.0, "{x} {} {want}", out[3][x]);

@@ -69,7 +69,10 @@ pub(crate) fn weigh(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::Random;
+    use crate::{
+        guarded::{Edge, Guarded},
+        synthetic::Random,
+    };
 
     #[test]
     fn levels_are_bit_equal_and_sum_what_they_say() {
@@ -82,12 +85,15 @@ mod tests {
             };
             let (gradient, grey) = (words_of(-2040, 4081), words_of(0, 4081));
             let run = |level: Level| {
-                let mut weighted = vec![0; len * pairs];
-                let mut sums: [Vec<f32>; 4] = std::array::from_fn(|_| vec![0.0; len]);
+                let guarded = |words: &[i32]| Guarded::new(words, Edge::End);
+                let (gradient, grey) = (guarded(&gradient), guarded(&grey));
+                let mut weighted = guarded(&vec![0; len * pairs]);
+                let mut sums: [Guarded<f32>; 4] =
+                    std::array::from_fn(|_| Guarded::new(&vec![0.0; len], Edge::End));
                 let [ilt, it, st, stt] = &mut sums;
                 let mut out = Weighted { gradient: &mut weighted, ilt, it, st, stt };
                 weigh(level, &gradient, &grey, &words(&times), &mut out);
-                (weighted, sums)
+                (weighted.to_vec(), sums.map(|sum| sum.to_vec()))
             };
             let want = run(Level::Scalar);
             for level in Level::available() {

@@ -219,7 +219,10 @@ fn interpolate(level: Level, kernels: &Kernels, row: &[Sample], place: &[i32], g
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::Random;
+    use crate::{
+        guarded::{Edge, Guarded},
+        synthetic::Random,
+    };
 
     type Maps = [Vec<f32>; 6];
 
@@ -255,8 +258,9 @@ mod tests {
         Input { rows, gradient, grey, w, rate, offsets }
     }
 
-    fn run(level: Level, input: &Input, x0: usize) -> Maps {
-        let rows: Vec<&[Sample]> = input.rows.iter().map(|r| &r[..]).collect();
+    fn run(level: Level, input: &Input, x0: usize, edge: Edge) -> Maps {
+        let rows: Vec<Guarded<Sample>> = input.rows.iter().map(|r| Guarded::new(r, edge)).collect();
+        let rows: Vec<&[Sample]> = rows.iter().map(|r| &r[..]).collect();
         let (w, len) = (&input.w, input.w.len());
         let mut maps: Maps = std::array::from_fn(|_| vec![7.0; len]);
         let [at, valid, ig, g, gg, lg] = &mut maps;
@@ -279,9 +283,10 @@ mod tests {
         ] {
             for roughness in [0.3, 8.0, 120.0] {
                 let input = input(width, len, frames, roughness);
-                let want = run(Level::Scalar, &input, x0);
-                for level in Level::available() {
-                    assert_eq!(run(level, &input, x0), want, "{level} {width} {x0} {len}");
+                let want = run(Level::Scalar, &input, x0, Edge::End);
+                for (level, edge) in Level::available().flat_map(|l| Edge::BOTH.map(|e| (l, e))) {
+                    let got = run(level, &input, x0, edge);
+                    assert_eq!(got, want, "{level} {edge:?} {width} {x0} {len}");
                 }
             }
         }
@@ -292,7 +297,7 @@ mod tests {
     fn at_rest_it_is_the_plain_warp() {
         let mut input = input(200, 200, 10, 8.0);
         input.rate.fill(0.0);
-        let moving = run(Level::best(), &input, 0);
+        let moving = run(Level::best(), &input, 0, Edge::End);
         let rows: Vec<&[Sample]> = input.rows.iter().map(|r| &r[..]).collect();
         let mut maps: Maps = std::array::from_fn(|_| vec![7.0; 200]);
         let [at, valid, ig, g, gg, lg] = &mut maps;
@@ -319,7 +324,7 @@ mod tests {
         input.rows = rows;
         input.w = vec![4.3; 120];
         input.rate = vec![0.5; 120];
-        let out = run(Level::best(), &input, 0);
+        let out = run(Level::best(), &input, 0, Edge::End);
         for (x, (g, at)) in out[3].iter().zip(&out[0]).enumerate().take(100).skip(20) {
             let want: f64 =
                 (0..4).map(|k| f(x as f64 - 4.3 - 0.5 * (f64::from(k) - 3.0)) / 4.0).sum();
