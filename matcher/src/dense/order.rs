@@ -49,6 +49,9 @@ const SIGMA_PX: (f32, f32) = (0.002, 0.05);
 const LOSS_MIN: f32 = 1e-4;
 /// Rows under the smoothing.
 const SIDE: usize = 2 * RADIUS + 1;
+/// Pixels from one that is sampled to the next, and samples of a task.
+const SAMPLE: usize = 97;
+const SAMPLES: usize = 256;
 /// Rows of a task, which looks at [`SIDE`] - 1 more.
 const BAND: usize = 96;
 
@@ -128,18 +131,29 @@ impl OrderChoice {
         let apart = 2 * RADIUS + 1;
         let (first, second) = (maps.first_px.as_slice(), maps.second_px.as_slice());
         let difference = |i: usize| second[i] - first[i];
-        self.sample.clear();
-        let pairs = (0..first.len().saturating_sub(apart)).step_by(97);
-        let changes = pairs.map(|i| (difference(i) - difference(i + apart)).abs());
         let half = std::f32::consts::FRAC_1_SQRT_2;
-        self.sample.extend(changes.filter(|d| !d.is_nan()).map(|d| d * half));
+        self.take(first.len().saturating_sub(apart), |i| {
+            (difference(i) - difference(i + apart)).abs() * half
+        });
         let change = median(&mut self.sample).unwrap_or(0.0);
         let sigma = (change / 0.6745).clamp(SIGMA_PX.0, SIGMA_PX.1);
-        self.sample.clear();
-        let losses = maps.zncc.as_slice().iter().step_by(97).filter(|z| !z.is_nan());
-        self.sample.extend(losses.map(|z| (1.0 - z).max(LOSS_MIN)));
+        let zncc = maps.zncc.as_slice();
+        self.take(zncc.len(), |i| match zncc[i] {
+            z if z.is_nan() => z,
+            z => (1.0 - z).max(LOSS_MIN),
+        });
         let loss = median(&mut self.sample).unwrap_or(1.0);
         sigma / loss.sqrt()
+    }
+
+    /// Takes a sample of the values of a map's pixels that are not NaN: each is a line from memory.
+    fn take(&mut self, pixels: usize, value: impl Fn(usize) -> f32 + Sync + Send) {
+        self.sample.resize(pixels.div_ceil(SAMPLE), 0.0);
+        self.sample.par_chunks_mut(SAMPLES).enumerate().share(|(k, sample)| {
+            let from = k * SAMPLES;
+            sample.iter_mut().zip(from..).for_each(|(to, i)| *to = value(i * SAMPLE));
+        });
+        self.sample.retain(|v| !v.is_nan());
     }
 }
 
