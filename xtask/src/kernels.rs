@@ -1,4 +1,4 @@
-//! What holds the matcher's kernels besides their tests: a memory checker, instruction counts that a
+//! What holds the kernels besides their tests: a memory checker, instruction counts that a
 //! busy machine does not disturb, and the tests as an AArch64 program.
 
 use std::collections::BTreeMap;
@@ -16,24 +16,37 @@ const SLACK: f64 = 1.15;
 /// Pixels of the frame that `matcher/examples/instruction_counts.rs` matches.
 const PIXELS: f64 = 256.0 * 192.0;
 
-/// Runs the matcher's unit tests, whose images have odd sizes, under valgrind: the plain kernels and
-/// the AVX2 ones, for valgrind knows no AVX-512.
+/// Libraries with kernels, and which of their unit tests are about them; all without a name.
+const CHECKED: [(&str, &[&str]); 2] =
+    [("stspp_matcher", &[]), ("stspp", &["resample::", "reproject::"])];
+
+/// Runs the kernels' unit tests, whose images have odd sizes, under valgrind: the plain kernels and the
+/// AVX2 ones, for valgrind knows no AVX-512.
 pub fn memory_check() -> Outcome {
     if let Err(why) = debian::ensure(&["valgrind"]) {
         return Outcome::Skipped(why);
     }
     let mut build = workspace::cargo();
-    build.args(["test", "--locked", "-p", "stspp-matcher", "--lib", "--no-run"]);
-    match executable(build, "lib") {
-        Err(why) => Outcome::Failed(why),
-        Ok(binary) => {
-            let mut valgrind = Command::new("valgrind");
-            valgrind.args(["-q", "--error-exitcode=9", "--leak-check=no"]).arg(binary);
-            // One thread, so that an error stands below the name of its test.
-            valgrind.arg("--test-threads=1");
-            stage::command(valgrind)
+    // Of the whole workspace, as the stage of all tests has built them.
+    build.args(["test", "--locked", "--workspace", "--lib", "--no-run"]);
+    let binaries = match executables(build, "lib") {
+        Ok(binaries) => binaries,
+        Err(why) => return Outcome::Failed(why),
+    };
+    for (library, tests) in CHECKED {
+        let Some(binary) = binaries.get(library) else {
+            return Outcome::Failed(format!("no tests of {library} were built"));
+        };
+        let mut valgrind = Command::new("valgrind");
+        valgrind.args(["-q", "--error-exitcode=9", "--leak-check=no"]).arg(binary).args(tests);
+        // One thread, so that an error stands below the name of its test.
+        valgrind.arg("--test-threads=1");
+        let outcome = stage::command(valgrind);
+        if !matches!(outcome, Outcome::Passed(_)) {
+            return outcome;
         }
     }
+    Outcome::Passed(String::new())
 }
 
 /// Counts the instructions of one small frame per kernel, at the AVX2 level, and compares them with
@@ -65,7 +78,8 @@ fn read_kept() -> Result<BTreeMap<String, f64>, String> {
 fn count() -> Result<Option<Vec<(f64, String)>>, String> {
     let mut build = workspace::cargo();
     build.args(["build", "--locked", "-p", "stspp-matcher", "--example", "instruction_counts"]);
-    let binary = executable(build, "example")?;
+    let mut binaries = executables(build, "example")?;
+    let binary = binaries.remove("instruction_counts").ok_or("no example was built")?;
     let file = workspace::root().join("target/instruction_counts.callgrind");
     let mut run = Command::new("valgrind");
     run.args(["-q", "--tool=callgrind"]);
@@ -152,13 +166,17 @@ fn output(mut command: Command) -> Result<String, String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Builds, and gives the executable of the target of that kind.
-fn executable(mut build: Command, kind: &str) -> Result<PathBuf, String> {
+/// Builds, and gives the executables of that kind of target by the targets' names.
+fn executables(mut build: Command, kind: &str) -> Result<BTreeMap<String, PathBuf>, String> {
     build.arg("--message-format=json-render-diagnostics");
     let text = output(build)?;
-    text.lines()
+    let messages = text
+        .lines()
         .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
-        .filter(|m| m["reason"] == "compiler-artifact" && m["target"]["kind"][0] == kind)
-        .find_map(|m| m["executable"].as_str().map(PathBuf::from))
-        .ok_or_else(|| format!("no {kind} was built"))
+        .filter(|m| m["reason"] == "compiler-artifact" && m["target"]["kind"][0] == kind);
+    let named = messages.filter_map(|m| {
+        let (name, path) = (m["target"]["name"].as_str()?, m["executable"].as_str()?);
+        Some((name.to_owned(), PathBuf::from(path)))
+    });
+    Ok(named.collect())
 }

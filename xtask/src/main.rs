@@ -28,7 +28,7 @@ cargo xtask firmware [f330] [f350] [--install] [--exercise] [--test]
                              --install gets the compiler's target, --test runs its host tests
 cargo xtask firmware flash f330|f350 [--check] [ELF]
                              checks an image and writes it with a debug probe (probe-rs)
-cargo xtask kernels          checks the matcher's kernels under valgrind, compares their instruction
+cargo xtask kernels          checks the kernels under valgrind, compares the matcher's instruction
                              counts, and tests the NEON ones under emulation
 cargo xtask e2e [NAME,...]   plugs the simulated sensor into a Debian kernel in QEMU and tries the
                              stspp binary there: all scenarios, or those with a NAME in their name

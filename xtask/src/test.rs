@@ -83,7 +83,7 @@ type Named = (&'static str, fn() -> Outcome);
 /// What needs Debian packages beyond the firmware's.
 const DEEPER: [Named; 4] = [("Linux guest", e2e::stage), KERNELS[0], KERNELS[1], KERNELS[2]];
 
-/// The matcher's kernels beyond their tests.
+/// The kernels beyond their tests.
 const KERNELS: [Named; 3] = [
     ("memory check", kernels::memory_check),
     ("instruction counts", kernels::instruction_counts),
