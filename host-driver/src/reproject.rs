@@ -1,7 +1,11 @@
 //! From disparities to depth and points.
 
 #[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
 mod avx512;
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+mod front;
 #[cfg(target_arch = "aarch64")]
 mod neon;
 mod plain;
@@ -127,6 +131,9 @@ fn pack_row(level: Level, row: &Row, from: &Sources<'_>, part: &mut Part<'_>, at
         // SAFETY: the level is this processor's; lengths are as checked.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 => unsafe { avx512::pack_row(row, from, part, at) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 => unsafe { avx2::pack_row(row, from, part, at) },
         // SAFETY: as above.
         #[cfg(target_arch = "aarch64")]
         Level::Neon => unsafe { neon::pack_row(row, from, part, at) },

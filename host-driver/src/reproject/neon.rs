@@ -2,31 +2,13 @@
 
 use std::arch::aarch64::*;
 
-use super::{Part, Row, Sources, plain};
+use super::{
+    Part, Row, Sources,
+    front::{FRONT, LANES},
+    plain,
+};
 
 const _: () = assert!(size_of::<nalgebra::Point3<f32>>() == 3 * size_of::<f32>());
-
-/// Pixels of a vector.
-const LANES: usize = 4;
-
-/// For each set of pixels, as bits, the bytes of theirs, and zeros behind.
-const FRONT: [[u8; 16]; 16] = {
-    let mut front = [[u8::MAX; 16]; 16];
-    let mut set = 0;
-    while set < 16 {
-        let (mut lane, mut to) = (0, 0);
-        while lane < LANES {
-            let mut byte = 0;
-            while byte < 4 && set >> lane & 1 == 1 {
-                front[set][to] = (4 * lane + byte) as u8;
-                (byte, to) = (byte + 1, to + 1);
-            }
-            lane += 1;
-        }
-        set += 1;
-    }
-    front
-};
 
 /// # Safety
 /// The processor has NEON; there is as much of everything as [`super::pack_row`] checks.
