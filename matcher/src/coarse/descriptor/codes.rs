@@ -30,6 +30,8 @@ pub(super) struct Codes {
     /// A row of means over time, until it is in the sums.
     new: Aligned<i16>,
     mean: Aligned<i8>,
+    /// The stack that the rows are of, and the row that would follow.
+    follows: Option<(u64, usize)>,
 }
 
 /// A window and the fixed-point factors of its mean.
@@ -65,8 +67,13 @@ impl Codes {
         Scale::new(frames).radius
     }
 
-    /// Takes what row `y` needs of the rows before its last one. [`Codes::next`] must follow.
-    pub(super) fn begin(&mut self, level: Level, images: &[&Image<Sample>], y: usize) {
+    /// Takes what row `y` needs of the rows before its last one, if those are not here already: `stamp` is
+    /// another one for each stack. [`Codes::next`] must follow.
+    pub(super) fn begin(&mut self, level: Level, images: &[&Image<Sample>], y: usize, stamp: u64) {
+        if self.follows == Some((stamp, y)) {
+            return;
+        }
+        self.follows = Some((stamp, y));
         let (width, frames) = (images[0].width(), images.len());
         self.scale = Scale::new(frames);
         self.width = width;
@@ -91,6 +98,7 @@ impl Codes {
     /// Goes on to row `y`, which must follow the row of the last call.
     pub(super) fn next(&mut self, level: Level, images: &[&Image<Sample>], y: usize) {
         let (radius, width) = (self.scale.radius, self.width);
+        self.follows = self.follows.map(|(stamp, _)| (stamp, y + 1));
         self.enter(level, images, y + 2 * radius);
         vectorised!(
             level,

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use crate::{
     Image, Level, Sample,
     aligned::Aligned,
-    parallel::{PerThread, Share},
+    parallel::{self, PerThread, Share},
 };
 use codes::{BLOCK, Codes};
 
@@ -71,12 +71,20 @@ fn tests(frames: usize) -> [Test; 64] {
     tests
 }
 
-/// Rows of a task.
-const BAND: usize = 64;
+/// Bands of a run that are left to its thread.
+const LEFT: usize = 2;
+/// Rows of a task within a frame, where a thread's tasks follow each other and take over its rows...
+const BAND: usize = 16;
+/// ...and of one where they do not, and each begins with rows of its own.
+const BAND_ALONE: usize = 64;
 
 /// Working memory for descriptors, one per thread.
 #[derive(Debug, Default)]
-pub(crate) struct Scratch(PerThread<Codes>);
+pub(crate) struct Scratch {
+    codes: PerThread<Codes>,
+    /// Number of stacks described.
+    stamp: u64,
+}
 
 /// Descriptors of one image stack.
 #[derive(Debug, Default)]
@@ -116,18 +124,24 @@ impl Descriptors {
             _ => self.tests.insert((images.len(), tests(images.len()))).1,
         };
         let stride = self.stride;
-        let scratch = scratch.0.ready();
-        self.data.par_chunks_mut(stride * BAND).enumerate().share(|(band, rows)| {
-            scratch.with(|codes| {
-                codes.begin(level, images, band * BAND);
-                for (y, out) in (band * BAND..).zip(rows.chunks_mut(stride)) {
-                    codes.next(level, images, y);
-                    describe_row(level, &tests, codes, y, &mut out[MARGIN..][..blocks]);
-                    out[..MARGIN].fill(OUTSIDE);
-                    out[MARGIN + width..].fill(OUTSIDE);
-                }
-            });
-        });
+        scratch.stamp += 1;
+        let (stamp, scratch) = (scratch.stamp, scratch.codes.ready());
+        let band_rows = if parallel::is_shared() { BAND } else { BAND_ALONE };
+        self.data.par_chunks_mut(stride * band_rows).enumerate().share_runs(
+            LEFT,
+            |(band, rows)| {
+                scratch.with(|codes| {
+                    let top = band * band_rows;
+                    codes.begin(level, images, top, stamp);
+                    for (y, out) in (top..).zip(rows.chunks_mut(stride)) {
+                        codes.next(level, images, y);
+                        describe_row(level, &tests, codes, y, &mut out[MARGIN..][..blocks]);
+                        out[..MARGIN].fill(OUTSIDE);
+                        out[MARGIN + width..].fill(OUTSIDE);
+                    }
+                });
+            },
+        );
     }
 }
 
