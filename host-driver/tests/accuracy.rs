@@ -65,4 +65,7 @@ fn windows_told_the_truth_do_as_well_on_a_plane_as_the_matcher() {
     assert!((0.95..1.3).contains(&(first / far.frame_normal_rms_mm)), "{far:?}");
     assert!((1.5..2.3).contains(&(second / first)), "{far:?}");
     assert!((2.2..4.0).contains(&(small / first)), "{far:?}");
+    // Facing the cameras a step comes back all the way; only windows that show nothing keep what they are told.
+    assert!(far.left_of_shift.iter().all(|left| left.abs() < 0.05), "{far:?}");
+    assert!((1.0..1.3).contains(&(far.rest_normal_rms_mm[0] / first)), "{far:?}");
 }
