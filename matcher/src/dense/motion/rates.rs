@@ -82,8 +82,8 @@ impl Rates {
         });
     }
 
-    /// Whether anything moves fast enough to matter. Among thousands of blocks a few pass the test for noise, each alone; what
-    /// moves shows in the blocks around it, whose planes share its pixels.
+    /// Whether anything moves fast enough to matter. Among thousands of blocks a few pass the test for
+    /// noise, each alone; what moves shows in the blocks around it, whose planes share its pixels.
     pub fn any(&self) -> bool {
         let moves =
             |(c, r): (usize, usize)| self.around[r * self.columns + c].rate.abs() >= SLOWEST;
