@@ -11,8 +11,8 @@
 //! A fit that is told the truth also keeps some of it: one step from a place beside the truth does not
 //! come back all the way, least where one camera sees the surface foreshortened, so that its images are
 //! smoother along the row than the other's and differ less from step to step than the gradient says. Each
-//! window is therefore fitted a second time from [`SHIFT_PX`] beside the truth: the part of the shift that
-//! is left says where steps come to rest.
+//! window is therefore fitted a second time from 0.1 px beside the truth: the part of that which is left
+//! says where steps come to rest.
 
 use std::fmt::Write as _;
 
