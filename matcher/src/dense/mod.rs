@@ -21,6 +21,7 @@ pub(crate) mod normalise;
 pub mod order;
 pub(crate) mod refit;
 mod rings;
+mod sample;
 pub mod settle;
 pub(crate) mod solve;
 mod steps;

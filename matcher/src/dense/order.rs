@@ -19,6 +19,7 @@ use rayon::prelude::*;
 use super::{
     DenseMaps,
     moments::{PAD, across_sum, box_sum, slide_columns},
+    sample::SampledMedian,
 };
 use crate::{
     Image, Level,
@@ -49,9 +50,6 @@ const SIGMA_PX: (f32, f32) = (0.002, 0.05);
 const LOSS_MIN: f32 = 1e-4;
 /// Rows under the smoothing.
 const SIDE: usize = 2 * RADIUS + 1;
-/// Pixels from one that is sampled to the next, and samples of a task.
-const SAMPLE: usize = 97;
-const SAMPLES: usize = 256;
 /// Rows of a task, which looks at [`SIDE`] - 1 more.
 const BAND: usize = 96;
 
@@ -59,7 +57,7 @@ const BAND: usize = 96;
 #[derive(Debug, Default)]
 pub struct OrderChoice {
     bands: PerThread<Buffers>,
-    sample: Vec<f32>,
+    sample: SampledMedian,
 }
 
 #[derive(Debug, Default)]
@@ -132,35 +130,17 @@ impl OrderChoice {
         let (first, second) = (maps.first_px.as_slice(), maps.second_px.as_slice());
         let difference = |i: usize| second[i] - first[i];
         let half = std::f32::consts::FRAC_1_SQRT_2;
-        self.take(first.len().saturating_sub(apart), |i| {
+        let change = self.sample.of(first.len().saturating_sub(apart), |i| {
             (difference(i) - difference(i + apart)).abs() * half
         });
-        let change = median(&mut self.sample).unwrap_or(0.0);
-        let sigma = (change / 0.6745).clamp(SIGMA_PX.0, SIGMA_PX.1);
+        let sigma = (change.unwrap_or(0.0) / 0.6745).clamp(SIGMA_PX.0, SIGMA_PX.1);
         let zncc = maps.zncc.as_slice();
-        self.take(zncc.len(), |i| match zncc[i] {
+        let loss = self.sample.of(zncc.len(), |i| match zncc[i] {
             z if z.is_nan() => z,
             z => (1.0 - z).max(LOSS_MIN),
         });
-        let loss = median(&mut self.sample).unwrap_or(1.0);
-        sigma / loss.sqrt()
+        sigma / loss.unwrap_or(1.0).sqrt()
     }
-
-    /// Takes a sample of the values of a map's pixels that are not NaN: each is a line from memory.
-    fn take(&mut self, pixels: usize, value: impl Fn(usize) -> f32 + Sync + Send) {
-        self.sample.resize(pixels.div_ceil(SAMPLE), 0.0);
-        self.sample.par_chunks_mut(SAMPLES).enumerate().share(|(k, sample)| {
-            let from = k * SAMPLES;
-            sample.iter_mut().zip(from..).for_each(|(to, i)| *to = value(i * SAMPLE));
-        });
-        self.sample.retain(|v| !v.is_nan());
-    }
-}
-
-/// The middle value.
-fn median(values: &mut [f32]) -> Option<f32> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
 impl Buffers {

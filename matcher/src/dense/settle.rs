@@ -7,7 +7,7 @@
 
 use rayon::prelude::*;
 
-use super::DenseMaps;
+use super::{DenseMaps, sample::SampledMedian};
 use crate::{
     Image, Level, StereoStack,
     lanes::vectorised,
@@ -29,10 +29,6 @@ const OWN_SIMILARITY_MIN: f32 = 0.75;
 /// ...but where the light is weak, noise takes as much from a pixel that is right: it may lack so many times
 /// the loss of ZNCC that windows of the whole image have in the median.
 const OWN_LOSS: f32 = 8.0;
-/// Pixels from one ZNCC that the median looks at to the next.
-const SAMPLE: usize = 97;
-/// Samples of a task.
-const SAMPLES: usize = 256;
 
 /// Settles depth steps; keeps its buffers between frames.
 #[derive(Debug)]
@@ -43,7 +39,7 @@ pub struct Settle {
     blocks: Image<bool>,
     around: Image<bool>,
     level: Level,
-    losses: Vec<f32>,
+    losses: SampledMedian,
 }
 
 impl Settle {
@@ -55,7 +51,7 @@ impl Settle {
             blocks: Image::new(0, 0, false),
             around: Image::new(0, 0, false),
             level: level.usable(),
-            losses: Vec::new(),
+            losses: SampledMedian::default(),
         }
     }
 
@@ -137,19 +133,8 @@ impl Settle {
     /// The least similarity that a single pixel needs, by the noise of the whole image.
     fn own_similarity_min(&mut self, zncc: &Image<f32>) -> f32 {
         let zncc = zncc.as_slice();
-        self.losses.resize(zncc.len().div_ceil(SAMPLE), 0.0);
-        // Each is a line from memory.
-        self.losses.par_chunks_mut(SAMPLES).enumerate().share(|(k, losses)| {
-            let from = zncc[k * SAMPLES * SAMPLE..].iter().step_by(SAMPLE);
-            losses.iter_mut().zip(from).for_each(|(loss, z)| *loss = 1.0 - z);
-        });
-        self.losses.retain(|loss| !loss.is_nan());
-        let middle = self.losses.len() / 2;
-        if self.losses.is_empty() {
-            return OWN_SIMILARITY_MIN;
-        }
-        let (_, loss, _) = self.losses.select_nth_unstable_by(middle, f32::total_cmp);
-        OWN_SIMILARITY_MIN.min(1.0 - OWN_LOSS * *loss)
+        let loss = self.losses.of(zncc.len(), |i| 1.0 - zncc[i]);
+        loss.map_or(OWN_SIMILARITY_MIN, |loss| OWN_SIMILARITY_MIN.min(1.0 - OWN_LOSS * loss))
     }
 
     /// Marks the blocks that hold a step, and the blocks around.
