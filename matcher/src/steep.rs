@@ -7,7 +7,10 @@
 
 use rayon::prelude::*;
 
-use crate::{DisparityRange, Image, SAMPLES_PER_DN8, StereoStack, step::FRAMES_MIN};
+use crate::{DisparityRange, Image, SAMPLES_PER_DN8, StereoStack};
+
+/// Fewest frames: with fewer a row's window matches elsewhere by chance.
+const FRAMES_MIN: usize = 6;
 
 /// Columns of the window to either side of its centre.
 const RADIUS: usize = 3;

@@ -131,21 +131,23 @@ pub(crate) const FINE_RADIUS: usize = 2;
 ///
 /// On a limb the difference is large as well, but changes slowly, and the usual window has half the noise.
 const FINE_PX: (f32, f32) = (0.03, 0.06);
+/// The frames with which that is well above noise; with fewer, it has to be more.
+const FINE_FRAMES: f32 = 10.0;
 /// Half the base of that bend, in px: half a ridge of the length that the usual window loses.
 const BEND_REACH: usize = 4;
 /// A difference that is so many times larger counts like a bend: ridges along the row do not bend in it.
 const PER_BEND: f32 = 5.0;
 
 /// Brings the second order's disparities `second` to those of a window of [`FINE_RADIUS`] where the surface
-/// is finer than the usual window, which is told by how they differ from the `first` order's; `difference`
-/// is scratch.
+/// is finer than the usual window, which is told by how they differ from the `first` order's in so many
+/// `frames`; `difference` is scratch.
 ///
 /// `window` has the radius [`FINE_RADIUS`], `powers` are that radius's.
 pub(crate) fn fine_row(
     level: Level,
     window: &Window<'_>,
     powers: &Powers,
-    len: usize,
+    (len, frames): (usize, usize),
     (first, difference): (&[f32], &mut [f32]),
     second: &mut [f32],
 ) {
@@ -158,11 +160,13 @@ pub(crate) fn fine_row(
     for rows in [window.s, window.q, window.w] {
         assert!(rows.len() == 2 * FINE_RADIUS + 1 && rows.iter().all(|r| r.len() >= padded));
     }
+    let noise = (FINE_FRAMES / frames as f32).sqrt().max(1.0);
     dispatch!(
         level,
         fine_lanes(
             window: &Window<'_> = window,
             powers: &Powers = powers,
+            limits: (f32, f32) = (FINE_PX.0 * noise, FINE_PX.1 * noise),
             len: usize = len,
             difference: &[f32] = &difference[..padded],
             second: &mut [f32] = second,
@@ -174,13 +178,14 @@ pub(crate) fn fine_row(
 fn fine_lanes<V: Lanes>(
     window: &Window<'_>,
     powers: &Powers,
+    limits: (f32, f32),
     len: usize,
     difference: &[f32],
     second: &mut [f32],
 ) {
     let zero = V::splat(0.0);
-    let low = V::splat(FINE_PX.0);
-    let per = V::splat(1.0 / (FINE_PX.1 - FINE_PX.0));
+    let low = V::splat(limits.0);
+    let per = V::splat(1.0 / (limits.1 - limits.0));
     for at in (0..len).step_by(V::COUNT) {
         // SAFETY: `at + COUNT <= len`, and the rows have `PAD` on either side.
         let e = |i: usize| unsafe { V::load(difference.as_ptr().add(i)) };

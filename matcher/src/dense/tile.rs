@@ -417,7 +417,8 @@ impl Tile {
                     around(&self.w1, y, FINE_RADIUS, |w| {
                         let window = Window { s, q, w, limit: job.surface_px, sloped: true };
                         let rows = (first, &mut self.threes[..]);
-                        fine_row(level, &window, &self.fine_powers, len, rows, second);
+                        let (powers, frames) = (&self.fine_powers, job.frames);
+                        fine_row(level, &window, powers, (len, frames), rows, second);
                     });
                 });
             });

@@ -7,8 +7,14 @@ use super::{
 };
 use crate::{Image, StereoStack};
 
-/// Fewest frames whose grey values tell surfaces apart.
-pub const FRAMES_MIN: usize = 6;
+/// Fewest frames whose grey values tell surfaces apart: one has no changes over time.
+pub const FRAMES_MIN: usize = 2;
+
+/// Pixels of the row along a step whose grey values are pooled...
+const POOLED: usize = 3;
+/// ...and with fewer frames than [`FEW`], whose values agree by chance more often.
+const POOLED_OF_FEW: usize = 5;
+const FEW: usize = 6;
 
 /// Least light, as a part of the mean inside the surface: a pixel that the surface covers by half has
 /// a quarter. Less is asked for, as the light of single pixels in N patterns varies by chance.
@@ -36,6 +42,8 @@ pub(super) struct Judge<'a> {
     disparity_px: &'a Image<f32>,
     beside: &'a Image<u8>,
     limits: &'a Limits,
+    /// How many pixels of the row along the step are pooled.
+    in_row: usize,
 }
 
 /// How well a surface explains a pixel.
@@ -68,7 +76,8 @@ impl<'a> Judge<'a> {
         beside: &'a Image<u8>,
         limits: &'a Limits,
     ) -> Self {
-        Self { samples: Samples::new(stack), disparity_px, beside, limits }
+        let in_row = if stack.frames() < FEW { POOLED_OF_FEW } else { POOLED };
+        Self { samples: Samples::new(stack), disparity_px, beside, limits, in_row }
     }
 
     /// As [`Self::pixel`], of a place in the map.
@@ -113,17 +122,17 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Pools the pixel and its two neighbours along the step; `None` where the right camera
+    /// Pools the pixel and its next neighbours along the step; `None` where the right camera
     /// does not see the candidate. Below a similarity of `least` nothing else is looked at.
     #[inline(always)]
     fn evidence(&self, x: usize, y: usize, candidate: &Candidate, least: f32) -> Option<Evidence> {
         let own_px = self.disparity_px.row(y)[x];
         // The row along the step: across the direction inwards.
         let (ix, iy) = (candidate.inwards.0.signum(), candidate.inwards.1.signum());
-        let along = [(0, 0), (-iy, ix), (iy, -ix)];
-        let along = if (ix, iy) == (0, 0) { &along[..1] } else { &along[..] };
+        let along = [(0, 0), (-iy, ix), (iy, -ix), (-2 * iy, 2 * ix), (2 * iy, -2 * ix)];
+        let along = &along[..if (ix, iy) == (0, 0) { 1 } else { self.in_row }];
         let mut pooled = Signature::default();
-        let mut found = [(0, 0, 0.0, f32::NAN); 3];
+        let mut found = [(0, 0, 0.0, f32::NAN); POOLED_OF_FEW];
         for (&(dx, dy), found) in along.iter().zip(&mut found) {
             let at = (x.checked_add_signed(dx as isize), y.checked_add_signed(dy as isize));
             let (Some(px), Some(py)) = at else { continue };
