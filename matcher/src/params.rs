@@ -100,8 +100,9 @@ pub struct Advanced {
     /// from the local fit.
     pub surface_px: f32,
     /// Whether [`Method::Dense`] lets the pixels' own grey values decide at depth steps, as
-    /// [`Method::IcGn`] always does; from six frames on. On the simulated part 0.06 % of the points are
-    /// then wrong instead of 2.7 %, and 0.8 % fewer are found.
+    /// [`Method::IcGn`] always does; from two frames on. On the simulated part 0.03 % of the points are
+    /// then wrong instead of 2.7 %, and 0.9 % fewer are found; with three frames 0.26 instead of 3.5 %,
+    /// and 1.1 % fewer.
     pub settle_steps: bool,
     /// Interpolation of the right images in IC-GN.
     pub interpolation: Interpolation,

@@ -72,11 +72,15 @@ fn times_the_bound(frames: usize, shape: ShapeFunction) -> (f64, f64) {
 
 #[test]
 fn noise_is_within_1_4_times_the_cramer_rao_bound() {
-    for frames in [1, 2, 3, 5, 10, 16] {
+    // A single pattern leaves windows of which a few dots are all: they say little of a second order.
+    for (frames, most) in [(1, 5.5), (2, 1.4), (3, 1.4), (5, 1.4), (10, 1.4), (16, 1.4)] {
         for shape in [ShapeFunction::First, ShapeFunction::Auto] {
             let (ratio, found) = times_the_bound(frames, shape);
             println!("{frames} frames, {shape:?}: {ratio:.3} times the bound, {found:.4} found");
-            if false {}; assert!(ratio < 140.0, "{frames} frames, {shape:?}: {ratio:.3} times the bound");
+            assert!(
+                ratio < most && found > 0.99,
+                "{frames} frames, {shape:?}: {ratio:.3} times the bound"
+            );
         }
     }
 }
