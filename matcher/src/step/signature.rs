@@ -50,7 +50,7 @@ impl<'a> Samples<'a> {
     }
 
     /// Compares left pixel (x, y) with the right images at x - `disparity_px`; `None` where the right
-    /// camera does not see that. Between right pixels by Keys' cubic (1981).
+    /// camera does not see that, or not all pixels that the interpolation takes. Between right pixels by Keys' cubic (1981).
     #[inline(always)]
     pub fn signature(&self, x: usize, y: usize, disparity_px: f32) -> Option<Signature> {
         let (width, frames) = (self.stack.width(), self.stack.frames());
@@ -61,6 +61,13 @@ impl<'a> Samples<'a> {
         // At the image's sides the outer interval's cubic is continued.
         let whole = at.floor().clamp(1.0, width as f32 - 3.0);
         let column = whole as usize;
+        if let Some(mask) = self.stack.right_mask {
+            // Nothing is said by what a mask hides.
+            let seen: &[u8; 4] = mask.row(y)[column - 1..].first_chunk()?;
+            if seen.contains(&0) {
+                return None;
+            }
+        }
         let f = at - whole;
         let taps = [
             0.5 * f * (-1.0 + f * (2.0 - f)),
