@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 
 use stspp_matcher::{
-    Error as MatchError, Image, Matched, Matcher, Method, Params, Sample, ShapeFunction,
-    StereoStack,
+    DisparityRange, Error as MatchError, Image, Matched, Matcher, Method, Params, Sample,
+    ShapeFunction, StereoStack,
 };
 
 use crate::cpu_time::{Step, Stopwatch};
@@ -19,7 +19,7 @@ pub const FRAMES_MAX: usize = 16;
 pub const FRAMES_DEFAULT: usize = 10;
 
 /// How a recording is reconstructed.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Options {
     /// Depths that are measured.
     pub depth: DepthRange,
@@ -29,6 +29,12 @@ pub struct Options {
     pub method: Method,
     /// Order of the shape function.
     pub shape: ShapeFunction,
+    /// Half the side of the subset without its centre, 2 to 8 (for IC-GN at most 7): 4 is a subset of
+    /// 9 x 9 pixels. Larger ones
+    /// have less noise and less detail.
+    pub subset_radius: usize,
+    /// Points with a lower ZNCC are invalid.
+    pub zncc_min: f32,
     /// Frames to use: all up to 16 when `None`, the first 10 of a longer recording.
     pub frames: Option<usize>,
     /// First pair to use.
@@ -38,6 +44,24 @@ pub struct Options {
     /// Whether the dense method takes depth steps as the coarse search places them, instead of letting
     /// the pixels' own grey values decide.
     pub keep_steps: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        let params = Params::new(DisparityRange { min_px: 0, max_px: 0 });
+        Self {
+            depth: DepthRange::default(),
+            canvas: Canvas::default(),
+            method: params.method,
+            shape: params.shape,
+            subset_radius: params.advanced.subset_radius,
+            zncc_min: params.zncc_min,
+            frames: None,
+            first: 0,
+            threads: params.advanced.threads,
+            keep_steps: !params.advanced.settle_steps,
+        }
+    }
 }
 
 impl Options {
@@ -51,9 +75,16 @@ impl Options {
 
     /// The matcher's parameters for images rectified so.
     pub fn params(&self, rectifier: &Rectifier) -> Params {
-        let mut params = Params::new(rectifier.disparity_range());
+        self.params_in(rectifier.disparity_range())
+    }
+
+    /// The matcher's parameters for candidate disparities.
+    pub(crate) fn params_in(&self, disparity: DisparityRange) -> Params {
+        let mut params = Params::new(disparity);
         params.method = self.method;
         params.shape = self.shape;
+        params.zncc_min = self.zncc_min;
+        params.advanced.subset_radius = self.subset_radius;
         params.advanced.threads = self.threads;
         params.advanced.settle_steps = !self.keep_steps;
         params

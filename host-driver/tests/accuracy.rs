@@ -1,21 +1,29 @@
 //! The accuracy tables on a small simulated sensor: what they say must follow from the physics.
 #![cfg(feature = "sim")]
 
-use stspp::accuracy::tables::{Case, Setting, to_text};
+use stspp::accuracy::tables::{Case, to_text};
 use stspp::accuracy::{bound, maps};
+use stspp::reconstruct::Options;
 use stspp_hil_sim::world::{SceneSpec, SensorModel};
 use stspp_matcher::Method;
 
 fn case(scene: &str, options: &[(&str, &str)], frames: usize) -> Case {
     let spec = SceneSpec::parse(scene, options).unwrap();
-    Case::new(&spec, SensorModel::default().scaled_down(2), frames, &mut |_| {}).unwrap()
+    Case::new(
+        &spec,
+        SensorModel::default().scaled_down(2),
+        frames,
+        &Options::default(),
+        &mut |_| {},
+    )
+    .unwrap()
 }
 
 #[test]
 fn refinement_and_more_frames_bring_accuracy() {
     let case = case("sphere", &[], 6);
-    let icgn = Setting { method: Method::IcGn, ..Setting::default() };
-    let parabola = Setting { method: Method::Parabola, ..Setting::default() };
+    let icgn = Options { method: Method::IcGn, ..Options::default() };
+    let parabola = Options { method: Method::Parabola, ..Options::default() };
     let (few, _) = case.line("sphere", 2, icgn).unwrap();
     let (many, frame) = case.line("sphere", 6, icgn).unwrap();
     let (coarse, _) = case.line("sphere", 6, parabola).unwrap();
@@ -54,8 +62,8 @@ fn refinement_and_more_frames_bring_accuracy() {
 #[test]
 fn windows_told_the_truth_do_as_well_on_a_plane_as_the_matcher() {
     let case = case("plane", &[("distance_m", "1")], 6);
-    let dense = Setting { method: Method::Dense, ..Setting::default() };
-    let dense = Setting { shape: stspp_matcher::ShapeFunction::First, ..dense };
+    let dense = Options { method: Method::Dense, ..Options::default() };
+    let dense = Options { shape: stspp_matcher::ShapeFunction::First, ..dense };
     let (_, frame) = case.line("plane 1 m", 6, dense).unwrap();
     let classes = bound::bound(case.stack(), 6, &frame, case.truth());
     println!("{}", bound::to_text(&classes));

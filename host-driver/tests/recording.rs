@@ -157,6 +157,37 @@ fn a_foreign_recording_reconstructs() {
     }
 }
 
+/// The two knobs of quality: the subset's size against noise, the least ZNCC against the number of points.
+#[test]
+fn larger_subsets_have_less_noise_and_a_higher_zncc_fewer_points() {
+    let folder = Folder::new("knobs");
+    record(&folder, 3, false);
+    let recording = Recording::open(folder.path("")).unwrap();
+    let cloud = |subset_radius: usize, zncc_min: f32| {
+        let options = Options { subset_radius, zncc_min, ..options(Method::Dense) };
+        reconstruct(&recording, &options, &mut |_| {}).unwrap().frame.point_cloud()
+    };
+    let rms = |radius: usize| {
+        let points = cloud(radius, 0.8).points_left_m;
+        let error = |z: f32, x: f32| f64::from(z) - DISTANCE - SLOPE * f64::from(x);
+        let squares: f64 = points.iter().map(|p| error(p.z, p.x).powi(2)).sum();
+        (squares / points.len() as f64).sqrt()
+    };
+    let [small, usual, large] = [2, 4, 8].map(rms);
+    assert!(small > 1.2 * usual && usual > 1.2 * large, "{small} {usual} {large}");
+    let (all, good) = (cloud(4, 0.8), cloud(4, 0.995));
+    assert!(
+        good.len() < all.len() && good.len() > all.len() / 10,
+        "{} of {}",
+        good.len(),
+        all.len()
+    );
+    assert!(good.zncc.iter().all(|z| *z >= 0.995));
+    let wrong = Options { subset_radius: 9, ..options(Method::Dense) };
+    let error = reconstruct(&recording, &wrong, &mut |_| {}).unwrap_err().to_string();
+    assert!(error.contains("subset_radius") && error.contains("2 to 8"), "{error}");
+}
+
 /// Each way to spoil a recording, and what the error must say.
 #[test]
 fn wrong_recordings_are_named() {

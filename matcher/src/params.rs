@@ -1,6 +1,8 @@
 //! What a user can set: a few stable parameters, the rest under [`Advanced`].
 
-use crate::{Error, Level, icgn::prepare::SUBSET_RADIUS_LIMIT};
+use crate::{
+    Error, Level, dense::RADIUS_LIMIT as DENSE_RADIUS_LIMIT, icgn::prepare::SUBSET_RADIUS_LIMIT,
+};
 
 /// Largest magnitude of a disparity, in pixels.
 pub const DISPARITY_LIMIT_PX: i32 = 16_384;
@@ -83,7 +85,7 @@ pub struct Advanced {
     pub retry_radius: usize,
     /// Points whose similarity 1 - cost is at most this are tried again (paper: 0.8).
     pub retry_similarity: f32,
-    /// Subset radius of the refinement (paper: 4, a 9x9 window).
+    /// Subset radius of the refinement (paper: 4, a 9x9 window): 2 to 8, for IC-GN at most 7.
     pub subset_radius: usize,
     /// IC-GN ends when the 2-norm of the increment is at most this (paper: 0.001).
     pub convergence_px: f64,
@@ -171,7 +173,11 @@ impl Params {
         within("advanced.census_radius", a.census_radius, 1, RADIUS_LIMIT)?;
         within("advanced.retry_radius", a.retry_radius, a.census_radius, RADIUS_LIMIT)?;
         within("advanced.retry_similarity", a.retry_similarity, 0.0, 1.0)?;
-        within("advanced.subset_radius", a.subset_radius, 2, SUBSET_RADIUS_LIMIT)?;
+        let subset_radius_max = match self.method {
+            Method::IcGn => SUBSET_RADIUS_LIMIT,
+            Method::Dense | Method::Parabola => DENSE_RADIUS_LIMIT,
+        };
+        within("advanced.subset_radius", a.subset_radius, 2, subset_radius_max)?;
         within("advanced.convergence_px", a.convergence_px, 1e-9, 1.0)?;
         within("advanced.iterations_max", a.iterations_max, 1, 1000)?;
         within("advanced.left_right_px", a.left_right_px, 0.0, 1e6)?;

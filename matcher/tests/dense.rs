@@ -248,7 +248,7 @@ fn thin_objects_are_found_nearly_as_often_as_by_brute_force() {
 fn any_size_window_and_number_of_frames_gives_a_map_of_the_size() {
     let mut random = Random::new(9);
     for (width, height) in [(1, 1), (5, 3), (31, 17), (33, 40), (97, 9), (130, 66)] {
-        for (frames, radius) in [(1, 2), (2, 7), (3, 4), (16, 3)] {
+        for (frames, radius) in [(1, 2), (2, 8), (3, 4), (5, 7), (16, 3)] {
             let stack: Vec<Image<Sample>> = (0..2 * frames)
                 .map(|_| Image::new(width, height, 0).map(|_: Sample| random.bits() as Sample))
                 .collect();

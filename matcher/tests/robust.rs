@@ -38,7 +38,7 @@ fn valid(matched: &Matched) -> usize {
     matched.disparity_px.as_slice().iter().filter(|d| d.is_finite()).count()
 }
 
-const METHODS: [Method; 2] = [Method::Parabola, Method::IcGn];
+const METHODS: [Method; 3] = [Method::Parabola, Method::IcGn, Method::Dense];
 
 #[test]
 fn images_without_texture_have_no_disparity() {
@@ -123,12 +123,14 @@ fn one_candidate_and_candidates_outside_the_image() {
     let images = noise(40, 20, 3, 9);
     for method in METHODS {
         // Everything is at disparity 0, the only candidate: nothing competes with it.
+        // The dense method leaves a rim out.
+        let least = if method == Method::Dense { 600 } else { 700 };
         let matched = run(&images, &images, params(method, 0, 0)).unwrap();
-        assert!(valid(&matched) > 700, "{method:?}: {}", valid(&matched));
+        assert!(valid(&matched) > least, "{method:?}: {}", valid(&matched));
         let matched = run(&images, &images, params(method, 41, 900)).unwrap();
         assert_eq!(valid(&matched), 0);
         let matched = run(&images, &images, params(method, -16_384, 16_384)).unwrap();
-        assert!(valid(&matched) > 700, "{method:?}: {}", valid(&matched));
+        assert!(valid(&matched) > least, "{method:?}: {}", valid(&matched));
     }
 }
 
@@ -160,11 +162,11 @@ proptest! {
         radii in (1usize..=8, 0usize..=7, 2usize..=7),
         kind in 0usize..4,
         second in any::<bool>(),
-        refine in any::<bool>(),
+        method in 0usize..3,
         level in 0usize..4,
         seed in any::<u64>(),
     ) {
-        let mut p = params(if refine { Method::IcGn } else { Method::Parabola }, min_px, min_px + span);
+        let mut p = params(METHODS[method], min_px, min_px + span);
         p.shape = if second { ShapeFunction::Second } else { ShapeFunction::First };
         p.advanced.census_radius = radii.0;
         p.advanced.retry_radius = (radii.0 + radii.1).min(8);
@@ -195,7 +197,7 @@ proptest! {
         let matched = Matcher::new(p).unwrap().match_stack(&stack).unwrap();
         prop_assert_eq!(matched.disparity_px.width(), width);
         for (d, z) in matched.disparity_px.as_slice().iter().zip(matched.zncc.as_slice()) {
-            if refine {
+            if METHODS[method] != Method::Parabola {
                 prop_assert_eq!(d.is_nan(), z.is_nan());
             }
             // The sub-pixel stages move a match by little.

@@ -5,8 +5,9 @@ use stspp_matcher::Image;
 
 use super::budget;
 use super::score::OUTLIER_M;
-use super::tables::{AccuracyError, Case, Setting};
+use super::tables::{AccuracyError, Case};
 use crate::DepthFrame;
+use crate::reconstruct::Options;
 
 /// Errors of two matches at pixels that both have within 5 mm of the truth.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -53,12 +54,12 @@ pub fn compare(
     case: &Case,
     scene: &str,
     frames: usize,
-    setting: Setting,
-    reference: Setting,
+    options: Options,
+    reference: Options,
 ) -> Result<(Vec<Compared>, Vec<ComparedCircle>), AccuracyError> {
-    let (_, frame) = case.line(scene, frames, setting)?;
+    let (_, frame) = case.line(scene, frames, options)?;
     let (_, other) = case.line(scene, frames, reference)?;
-    let truth = case.truth_for(setting, frames);
+    let truth = case.truth_for(options, frames);
     let distance = budget::step_distances(&frame, truth);
     let errors = |frame: &DepthFrame| {
         let mut errors = Image::new(frame.depth_m.width(), frame.depth_m.height(), f32::NAN);

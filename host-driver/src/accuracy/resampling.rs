@@ -2,13 +2,14 @@
 
 use serde::Serialize;
 use stspp_hil_sim::world::{SceneSpec, SensorModel};
-use stspp_matcher::{Image, Matcher, Params, SAMPLES_PER_DN8, Sample};
+use stspp_matcher::{Image, Matcher, SAMPLES_PER_DN8, Sample};
 
 use super::score::central_plane_mm;
-use super::tables::{AccuracyError, Setting};
+use super::tables::AccuracyError;
 use super::{CanvasTruth, Capture};
+use crate::reconstruct::Options;
 use crate::reconstruct::RectifiedStack;
-use crate::rectify::{DepthRange, Kernel, Rectifier};
+use crate::rectify::{Kernel, Rectifier};
 
 /// A way to rectify, and the plane that comes of it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -43,7 +44,7 @@ pub fn plane(
     distance_m: f64,
     seed: u64,
     frames: usize,
-    setting: Setting,
+    options: &Options,
     progress: &mut dyn FnMut(String),
 ) -> Result<Vec<Resampled>, AccuracyError> {
     let spec = SceneSpec::parse("plane", &[("distance_m", &distance_m.to_string())])?;
@@ -54,8 +55,7 @@ pub fn plane(
     let mut found = Vec::new();
     for (kernel, bits) in WAYS {
         progress(format!("plane at {distance_m} m: {kernel:?}, {bits} bits"));
-        let rectifier =
-            Rectifier::with_kernel(&capture.calibration, DepthRange::default(), kernel)?;
+        let rectifier = Rectifier::with_kernel(&capture.calibration, options.depth, kernel)?;
         let mut stack = RectifiedStack::new(rectifier, &capture.pairs, capture.labels.clone())?;
         if bits == 8 {
             stack.left.iter_mut().chain(&mut stack.right).for_each(round_to_8_bits);
@@ -65,9 +65,7 @@ pub fn plane(
         // The canvas is the same for every kernel.
         let truth = truth
             .get_or_insert_with(|| CanvasTruth::trace(&capture.world, geometry, mask, centre_ns));
-        let mut params = Params::new(stack.rectifier.disparity_range());
-        (params.method, params.shape) = (setting.method, setting.shape);
-        params.advanced.threads = setting.threads;
+        let params = options.params_in(stack.rectifier.disparity_range());
         let frame = stack.depth_frame(&mut Matcher::new(params)?, 0..frames)?;
         let (fit_rms_mm, bias_mm) = central_plane_mm(&frame, truth).unwrap_or((f64::NAN, f64::NAN));
         let kernel = format!("{kernel:?}");

@@ -2,14 +2,14 @@
 
 use serde::Serialize;
 use stspp_hil_sim::world::{SceneSpec, SensorModel, WorldError};
-use stspp_matcher::{Error as MatchError, Matcher, Method, Params, ShapeFunction};
+use stspp_matcher::{Error as MatchError, Matcher, Method};
 
 use super::circles::{self, FoundCircle};
 use super::score::{central_plane_mm, score, sphere_rms_mm};
 use super::{CanvasTruth, Capture, Score};
 use crate::DepthFrame;
 use crate::reconstruct::{Options, RectifiedStack};
-use crate::rectify::{DepthRange, Rectifier, RectifyError};
+use crate::rectify::RectifyError;
 
 /// Radius of the sphere in metres.
 const SPHERE_RADIUS_M: f64 = 0.075;
@@ -33,26 +33,6 @@ pub enum AccuracyError {
     /// The stack cannot be matched.
     #[error(transparent)]
     Match(#[from] MatchError),
-}
-
-/// How the table's frames are matched.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Setting {
-    /// How the sub-pixel disparity is found.
-    pub method: Method,
-    /// Order of the shape function.
-    pub shape: ShapeFunction,
-    /// Threads of the matcher; all cores when `None`.
-    pub threads: Option<usize>,
-    /// Whether the dense method takes depth steps as the coarse search places them.
-    pub keep_steps: bool,
-}
-
-impl From<&Options> for Setting {
-    fn from(options: &Options) -> Self {
-        let Options { method, shape, threads, keep_steps, .. } = *options;
-        Self { method, shape, threads, keep_steps }
-    }
 }
 
 /// A scene, simulated and rectified, with the truth of its canvas.
@@ -95,7 +75,7 @@ pub struct Line {
 }
 
 impl Case {
-    /// Simulates `frames` pairs of a scene.
+    /// Simulates `frames` pairs of a scene, for the depths and the canvas of `options`.
     ///
     /// # Errors
     /// For a scene or a sensor that cannot be simulated.
@@ -103,18 +83,19 @@ impl Case {
         scene: &SceneSpec,
         model: SensorModel,
         frames: usize,
+        options: &Options,
         progress: &mut dyn FnMut(usize),
     ) -> Result<Self, AccuracyError> {
         let capture = Capture::record(scene, model, frames, progress)?;
-        Self::of_capture(capture)
+        Self::of_capture(capture, options)
     }
 
     /// Rectifies a capture and traces its truth.
     ///
     /// # Errors
     /// For images that cannot be rectified.
-    pub fn of_capture(mut capture: Capture) -> Result<Self, AccuracyError> {
-        let rectifier = Rectifier::new(&capture.calibration, DepthRange::default())?;
+    pub fn of_capture(mut capture: Capture, options: &Options) -> Result<Self, AccuracyError> {
+        let rectifier = options.rectifier(&capture.calibration)?;
         let stack = RectifiedStack::new(rectifier, &capture.pairs, capture.labels.clone())?;
         let saturated = capture.saturated();
         // The raw images are not needed again, and there may be several cases.
@@ -140,8 +121,8 @@ impl Case {
 
     /// The truth of its canvas that a match of `frames` pairs is compared with: a matcher that estimates
     /// motion gives the newest frame's depth, others that of the window's middle.
-    pub fn truth_for(&self, setting: Setting, frames: usize) -> &CanvasTruth {
-        let with_motion = setting.method == Method::Dense && frames == self.stack.len();
+    pub fn truth_for(&self, options: Options, frames: usize) -> &CanvasTruth {
+        let with_motion = options.method == Method::Dense && frames == self.stack.len();
         self.newest.as_ref().filter(|_| with_motion).unwrap_or(&self.truth)
     }
 
@@ -150,7 +131,7 @@ impl Case {
         circles::find(frame, &self.capture.world, self.capture.centre_ns(0..frames))
     }
 
-    /// Matches the first `frames` pairs and compares with the truth. Also gives the depth frame.
+    /// Matches the first `frames` pairs as `options` say and compares with the truth. Also gives the depth frame.
     ///
     /// # Errors
     /// From the matcher.
@@ -158,19 +139,15 @@ impl Case {
         &self,
         scene: &str,
         frames: usize,
-        setting: Setting,
+        options: Options,
     ) -> Result<(Line, DepthFrame), AccuracyError> {
-        let mut params = Params::new(self.stack.rectifier.disparity_range());
-        params.method = setting.method;
-        params.shape = setting.shape;
-        params.advanced.threads = setting.threads;
-        params.advanced.settle_steps = !setting.keep_steps;
+        let params = options.params_in(self.stack.rectifier.disparity_range());
         let mut matcher = Matcher::new(params)?;
         let start = std::time::Instant::now();
         let frame = self.stack.depth_frame(&mut matcher, 0..frames)?;
         let match_wall_ms = start.elapsed().as_secs_f64() * 1e3;
         let world = &self.capture.world;
-        let truth = self.truth_for(setting, frames);
+        let truth = self.truth_for(options, frames);
         let sphere = |incidence_max_deg| {
             let fit =
                 sphere_rms_mm(&frame, truth, world, SPHERE_RADIUS_M, MARGIN_PX, incidence_max_deg);
@@ -187,8 +164,8 @@ impl Case {
         let line = Line {
             scene: scene.to_owned(),
             frames,
-            method: format!("{:?}", setting.method),
-            shape_function: format!("{:?}", setting.shape),
+            method: format!("{:?}", options.method),
+            shape_function: format!("{:?}", options.shape),
             fit_rms_mm: fit.0,
             bias_mm,
             radius_error_mm: fit.1,

@@ -48,6 +48,9 @@ const LEFT: usize = 4;
 /// Tasks of a thread where loops are rayon's: they let others take over what a busy core leaves.
 const TASKS: usize = 4;
 
+/// Largest radius of a window: 17 x 17 pixels.
+pub const RADIUS_LIMIT: usize = 8;
+
 /// The dense fit; keeps its buffers between frames.
 #[derive(Debug)]
 pub struct DenseFit {
@@ -89,11 +92,12 @@ impl DenseMaps {
 }
 
 impl DenseFit {
-    /// A fit with windows of 2 `radius` + 1 pixels a side; `radius` is brought to 2..=8.
+    /// A fit with windows of 2 `radius` + 1 pixels a side; `radius` is brought to
+    /// 2..=[`RADIUS_LIMIT`].
     pub fn new(level: Level, radius: usize, shape: ShapeFunction, surface_px: f32) -> Self {
         Self {
             level: level.usable(),
-            radius: radius.clamp(2, 8),
+            radius: radius.clamp(2, RADIUS_LIMIT),
             shape,
             surface_px,
             tiles: parallel::PerThread::default(),

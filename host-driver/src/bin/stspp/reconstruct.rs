@@ -48,6 +48,12 @@ pub struct Matching {
     /// Order of the subset's shape function.
     #[arg(long, value_enum, default_value_t)]
     pub order: OrderName,
+    /// Side of the square subset in pixels, odd, 5 to 17 (icgn: 15): larger ones have less noise and less detail.
+    #[arg(long, default_value_t = 9, value_name = "PX", value_parser = subset_px)]
+    pub subset: usize,
+    /// Least ZNCC of a point, -1 to 1: a higher one leaves fewer wrong points, and fewer right ones.
+    #[arg(long, default_value_t = 0.8, value_name = "ZNCC", allow_negative_numbers = true)]
+    pub zncc_min: f32,
     /// Frames to match, 1 to 16 [default: the recording's slots].
     #[arg(long)]
     pub frames: Option<usize>,
@@ -67,6 +73,12 @@ pub struct Matching {
     /// silhouettes, instead of letting the pixels' own grey values decide. Saves a few milliseconds.
     #[arg(long)]
     pub keep_steps: bool,
+}
+
+/// The side of a subset.
+fn subset_px(text: &str) -> Result<usize, String> {
+    let px = text.parse().ok().filter(|px| (5..=17).contains(px) && px % 2 == 1);
+    px.ok_or_else(|| "an odd number from 5 to 17 is needed".into())
 }
 
 /// Names of [`Method`].
@@ -145,6 +157,8 @@ impl Matching {
             canvas: self.canvas.canvas(),
             method: self.method.method(),
             shape: self.order.shape(),
+            subset_radius: self.subset / 2,
+            zncc_min: self.zncc_min,
             frames: self.frames,
             first: 0,
             threads: self.threads,
@@ -169,7 +183,9 @@ pub fn reconstruct_failure(error: &ReconstructError) -> Failure {
             "see --depth-min, --depth-max"
         }
         ReconstructError::Rectify(_) => "check camchain.yaml and the depth range",
-        ReconstructError::Match(_) => "see --method, --order, --threads",
+        ReconstructError::Match(_) => {
+            "see --method, --subset (with icgn up to 15), --zncc-min, --threads"
+        }
         ReconstructError::Window { .. } => "see --frames and --first",
         _ => {
             "a recording is camchain.yaml, left/00.png ..., right/00.png ... of equal number and size"

@@ -110,7 +110,7 @@ pub fn stream_options(source: Option<&Source>, matching: Option<&Matching>) -> S
     let defaults = StreamOptions::default();
     let timeout = source.and_then(|s| Duration::try_from_secs_f64(s.timeout).ok());
     StreamOptions {
-        matching: matching.map_or(defaults.matching.clone(), Matching::options),
+        matching: matching.map_or(defaults.matching, Matching::options),
         timeout: timeout.filter(|timeout| !timeout.is_zero()).unwrap_or(defaults.timeout),
         budget: defaults.budget,
     }

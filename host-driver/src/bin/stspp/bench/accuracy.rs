@@ -6,8 +6,9 @@ use serde_json::json;
 use stspp::accuracy::bound;
 use stspp::accuracy::budget::{self, Class};
 use stspp::accuracy::maps;
-use stspp::accuracy::tables::{self, AccuracyError, Case, Line, Setting};
+use stspp::accuracy::tables::{self, AccuracyError, Case, Line};
 use stspp::export::folder::OutputFolder;
+use stspp::reconstruct::Options;
 use stspp_hil_sim::world::{SceneSpec, SensorModel};
 use stspp_matcher::Method;
 
@@ -60,7 +61,6 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         scenes => scenes.iter().any(|s| s == scene),
     };
     let options = args.matching.options();
-    let setting = Setting::from(&options);
     let frames = args.matching.frames.unwrap_or(10);
     let spinner = output.spinner();
     let mut lines: Vec<Line> = Vec::new();
@@ -70,12 +70,12 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         Some(path) => Some(OutputFolder::create(path, true).map_err(|e| output_failure(&e))?),
         None => None,
     };
-    let mut measure = |case: &Case, name: &str, frames: usize, setting: Setting| {
+    let mut measure = |case: &Case, name: &str, frames: usize, options: Options| {
         spinner.set_message(format!("{name}: matching {frames} frames"));
-        let (line, frame) = case.line(name, frames, setting).map_err(|e| failure(&e))?;
-        let truth = case.truth_for(setting, frames);
+        let (line, frame) = case.line(name, frames, options).map_err(|e| failure(&e))?;
+        let truth = case.truth_for(options, frames);
         if let Some(folder) = &mut folder {
-            let method = format!("{:?}-{:?}", setting.method, setting.shape).to_lowercase();
+            let method = format!("{:?}-{:?}", options.method, options.shape).to_lowercase();
             let file = format!("{}-{frames}-{method}.png", name.replace(' ', "-"));
             folder
                 .file(&file, |out| maps::write_error_png(out, &frame, truth, 0.1))
@@ -92,10 +92,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         lines.push(line);
         Ok::<(), Failure>(())
     };
+    let matched = &options;
     let case = |scene: &str, options: &[(&str, &str)], frames: usize| {
         let spec = SceneSpec::parse(scene, options).map_err(AccuracyError::from)?;
         let model = SensorModel::with_seed(args.seed);
-        Case::new(&spec, model, frames, &mut |k| {
+        Case::new(&spec, model, frames, matched, &mut |k| {
             spinner.set_message(format!("{scene}: image {} of {frames}", k + 1));
         })
     };
@@ -103,40 +104,40 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         let most = args.counts.iter().copied().max().unwrap_or(frames);
         let case = case("sphere", &[], most).map_err(|e| failure(&e))?;
         for &count in &args.counts {
-            measure(&case, "sphere", count, setting)?;
+            measure(&case, "sphere", count, options)?;
         }
     }
     if wanted("planes") {
         for distance_m in ["1", "1.5", "2"] {
             let case =
                 case("plane", &[("distance_m", distance_m)], frames).map_err(|e| failure(&e))?;
-            measure(&case, &format!("plane {distance_m} m"), frames, setting)?;
+            measure(&case, &format!("plane {distance_m} m"), frames, options)?;
         }
     }
     // The statue is scored for the parabola too: what the refinement brings is the point of it.
     if wanted("statue") {
         let case = case("statue", &[], frames).map_err(|e| failure(&e))?;
-        let parabola = Setting { method: Method::Parabola, ..setting };
-        for setting in [parabola, setting] {
-            measure(&case, "statue", frames, setting)?;
+        let parabola = Options { method: Method::Parabola, ..options };
+        for options in [parabola, options] {
+            measure(&case, "statue", frames, options)?;
         }
     }
     if wanted("part") {
         let case = case("part", &[], frames).map_err(|e| failure(&e))?;
-        measure(&case, "part", frames, setting)?;
+        measure(&case, "part", frames, options)?;
     }
     // The same plane at rest, and away from and towards the sensor.
     if wanted("moving") {
         for speed_mm_s in ["0", "9", "-9"] {
-            let options = [("speed_mm_s", speed_mm_s)];
-            let case = case("moving-plane", &options, frames).map_err(|e| failure(&e))?;
-            measure(&case, &format!("plane {speed_mm_s} mm/s"), frames, setting)?;
+            let scene = [("speed_mm_s", speed_mm_s)];
+            let case = case("moving-plane", &scene, frames).map_err(|e| failure(&e))?;
+            measure(&case, &format!("plane {speed_mm_s} mm/s"), frames, options)?;
         }
     }
     if wanted("turntable") {
         for rpm in ["0", "1.2"] {
             let case = case("turntable", &[("rpm", rpm)], frames).map_err(|e| failure(&e))?;
-            measure(&case, &format!("turning {rpm} rpm"), frames, setting)?;
+            measure(&case, &format!("turning {rpm} rpm"), frames, options)?;
         }
     }
     if let Some(folder) = folder {

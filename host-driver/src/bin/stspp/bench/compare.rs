@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 
 use serde_json::json;
 use stspp::accuracy::compare::{self, Compared, ComparedCircle};
-use stspp::accuracy::tables::{AccuracyError, Case, Setting};
+use stspp::accuracy::tables::{AccuracyError, Case};
+use stspp::reconstruct::Options;
 use stspp_hil_sim::world::{SceneSpec, SensorModel};
 use stspp_matcher::{Method, ShapeFunction};
 
@@ -40,7 +41,7 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
-    let of = |method, shape| Setting { method, shape, threads: args.threads, keep_steps: false };
+    let of = |method, shape| Options { method, shape, threads: args.threads, ..Options::default() };
     let dense = of(Method::Dense, ShapeFunction::Auto);
     let reference = of(Method::IcGn, ShapeFunction::Second);
     let spinner = output.spinner();
@@ -51,7 +52,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         let failure = |e: AccuracyError| Failure::new(Kind::Input, &e);
         let spec = SceneSpec::parse(scene, &options).map_err(|e| failure(e.into()))?;
         let model = SensorModel::with_seed(args.seed);
-        let case = Case::new(&spec, model, args.frames, &mut |k| {
+        let case = Case::new(&spec, model, args.frames, &dense, &mut |k| {
             spinner.set_message(format!("{name}: image {} of {}", k + 1, args.frames));
         })
         .map_err(failure)?;

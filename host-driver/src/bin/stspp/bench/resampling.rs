@@ -4,7 +4,6 @@ use std::fmt::Write as _;
 
 use serde_json::json;
 use stspp::accuracy::resampling::{self, Resampled};
-use stspp::accuracy::tables::Setting;
 
 use crate::exit::{Failure, Kind};
 use crate::output::Output;
@@ -26,13 +25,12 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let options = args.matching.options();
-    let setting = Setting::from(&options);
     let frames = args.matching.frames.unwrap_or(10);
     let spinner = output.spinner();
     let mut lines: Vec<Resampled> = Vec::new();
     for &distance_m in &args.distances_m {
         let mut progress = |what: String| spinner.set_message(what);
-        let found = resampling::plane(distance_m, args.seed, frames, setting, &mut progress)
+        let found = resampling::plane(distance_m, args.seed, frames, &options, &mut progress)
             .map_err(|error| Failure::new(Kind::Input, error))?;
         lines.extend(found);
     }
