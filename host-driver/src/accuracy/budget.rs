@@ -59,16 +59,18 @@ struct Group {
     far: bool,
 }
 
-const GROUPS: [Group; 4] = [
+const INCIDENCES_DEG: &[f32] = &[30.0, 45.0, 60.0, 75.0, 82.0];
+const GROUPS: [Group; 5] = [
     Group { name: "px to a true step", bounds: &[1.0, 2.0, 4.0, 8.0], far: false },
     Group { name: "slope, px/px", bounds: &[0.1, 0.3, 0.6, 1.0, 2.0], far: true },
     Group { name: "bend of 9 x 9, px", bounds: &[0.01, 0.03, 0.1, 0.3], far: true },
-    Group { name: "incidence, deg", bounds: &[30.0, 45.0, 60.0, 75.0, 82.0], far: true },
+    Group { name: "incidence, deg", bounds: INCIDENCES_DEG, far: true },
+    Group { name: "at steps too", bounds: INCIDENCES_DEG, far: false },
 ];
 
 /// Classes the pixels of a frame by their distance from true depth steps and, more than 8 px away from
 /// these, by the true disparity's slope, by what a second-order surface over 9 x 9 pixels misses of it,
-/// and by how grazing the cameras see it.
+/// and by how grazing the cameras see it; by that also near steps.
 pub fn budget(frame: &DepthFrame, truth: &CanvasTruth) -> Vec<Class> {
     let (width, height) = (truth.depth_m.width(), truth.depth_m.height());
     let disparity = true_disparity_px(frame, truth);
