@@ -30,8 +30,7 @@ pub struct Options {
     /// Order of the shape function.
     pub shape: ShapeFunction,
     /// Half the side of the subset without its centre, 2 to 8 (for IC-GN at most 7): 4 is a subset of
-    /// 9 x 9 pixels. Larger ones
-    /// have less noise and less detail.
+    /// 9 x 9 pixels. Larger ones have less noise and less detail.
     pub subset_radius: usize,
     /// Points with a lower ZNCC are invalid.
     pub zncc_min: f32,

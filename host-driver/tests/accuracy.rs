@@ -2,7 +2,7 @@
 #![cfg(feature = "sim")]
 
 use stspp::accuracy::tables::{Case, to_text};
-use stspp::accuracy::{bound, maps};
+use stspp::accuracy::{bound, maps, similar};
 use stspp::reconstruct::Options;
 use stspp_hil_sim::world::{SceneSpec, SensorModel};
 use stspp_matcher::Method;
@@ -67,6 +67,15 @@ fn windows_told_the_truth_do_as_well_on_a_plane_as_the_matcher() {
     let (_, frame) = case.line("plane 1 m", 6, dense).unwrap();
     let classes = bound::bound(case.stack(), 6, &frame, case.truth());
     println!("{}", bound::to_text(&classes));
+    // And a plane is the same in both views: nearly every pixel is alike at its true place, and at another
+    // hardly one.
+    let alike = similar::similar(case.stack(), 6, &frame, case.truth());
+    println!("{}", similar::to_text(&alike));
+    assert!(alike[2].alike[3] > 0.97 && alike[2].found > 0.97, "{alike:?}");
+    assert_eq!((alike[1].visible, alike[0].visible), (0, alike[2].visible));
+    let elsewhere = self::case("plane", &[("distance_m", "1.1")], 6);
+    let unlike = similar::similar(case.stack(), 6, &frame, elsewhere.truth());
+    assert!(unlike[2].alike[3] < 0.1, "{unlike:?}");
     let far = &classes[4];
     assert!(far.points > 10_000 && classes[5].points >= far.points);
     let [first, second, .., small] = far.window_normal_rms_mm;

@@ -250,7 +250,7 @@ impl Scene<'_> {
 }
 
 /// Lanczos' kernel of eight taps for a fraction of a pixel; the taps sum to one.
-fn lanczos(fraction: f64) -> [f64; TAPS] {
+pub(super) fn lanczos(fraction: f64) -> [f64; TAPS] {
     let taps: [f64; TAPS] = std::array::from_fn(|k| {
         let x = std::f64::consts::PI * (k as f64 - (TAPS / 2 - 1) as f64 - fraction);
         let half = x / (TAPS / 2) as f64;

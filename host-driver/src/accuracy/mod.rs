@@ -9,6 +9,7 @@ pub mod compare;
 pub mod maps;
 pub mod resampling;
 pub mod score;
+pub mod similar;
 pub mod tables;
 pub mod truth;
 

@@ -6,6 +6,7 @@ use serde_json::json;
 use stspp::accuracy::bound;
 use stspp::accuracy::budget::{self, Class};
 use stspp::accuracy::maps;
+use stspp::accuracy::similar::{self, Alike};
 use stspp::accuracy::tables::{self, AccuracyError, Case, Line};
 use stspp::export::folder::OutputFolder;
 use stspp::reconstruct::Options;
@@ -35,7 +36,8 @@ pub struct Args {
     #[arg(long)]
     budget: bool,
     /// Also print how near fits of windows come that are told the truth, a sample of the pixels by distance
-    /// from true steps: what noise, blur and windows cost by themselves. Takes seconds a line.
+    /// from true steps: what noise, blur and windows cost by themselves; and how alike the cameras see each
+    /// pixel at its true place, which bounds how many can be found. Takes seconds a line.
     #[arg(long)]
     bound: bool,
     #[command(flatten)]
@@ -65,7 +67,7 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     let spinner = output.spinner();
     let mut lines: Vec<Line> = Vec::new();
     let mut budgets: Vec<(String, Vec<Class>)> = Vec::new();
-    let mut bounds: Vec<(String, Vec<bound::Class>)> = Vec::new();
+    let mut bounds: Vec<(String, Vec<bound::Class>, Vec<Alike>)> = Vec::new();
     let mut folder = match &args.maps {
         Some(path) => Some(OutputFolder::create(path, true).map_err(|e| output_failure(&e))?),
         None => None,
@@ -87,7 +89,8 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         }
         if args.bound {
             spinner.set_message(format!("{name}: windows that are told the truth"));
-            bounds.push((title, bound::bound(case.stack(), frames, &frame, truth)));
+            let alike = similar::similar(case.stack(), frames, &frame, truth);
+            bounds.push((title, bound::bound(case.stack(), frames, &frame, truth), alike));
         }
         lines.push(line);
         Ok::<(), Failure>(())
@@ -148,8 +151,11 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
     for (title, classes) in &budgets {
         text += &format!("\n{title}\n{}", budget::to_text(classes));
     }
-    for (title, classes) in &bounds {
+    for (title, classes, alike) in &bounds {
         text += &format!("\n{title}: RMS from the surface in mm\n{}", bound::to_text(classes));
+        let part =
+            "part of what both cameras see, by the similarity over time at its true place, %";
+        text += &format!("\n{title}: {part}\n{}", similar::to_text(alike));
     }
     let budgets: Vec<_> = budgets
         .iter()
@@ -157,7 +163,10 @@ pub fn run(args: &Args, output: &Output) -> Result<(), Failure> {
         .collect();
     let bounds: Vec<_> = bounds
         .iter()
-        .map(|(title, classes)| json!({ "line": title, "windows": bound::WINDOWS, "classes": classes }))
+        .map(|(title, classes, alike)| {
+            json!({ "line": title, "windows": bound::WINDOWS, "classes": classes,
+                "similarities": similar::SIMILARITIES, "alike": alike })
+        })
         .collect();
     let json = json!({ "seed": args.seed, "lines": lines, "budgets": budgets, "bounds": bounds });
     output.result(&text, &json);
