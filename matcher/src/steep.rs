@@ -33,7 +33,7 @@ const VALLEY: i32 = 2;
 const VARIANCE_MIN: f32 = 4.0;
 
 /// Fills gaps of `map` (NaN) where a row's grey values match uniquely. Does nothing with fewer than
-/// [`FRAMES_MIN`] frames.
+/// six frames.
 ///
 /// # Panics
 /// When the map and the checked stack differ in size.
