@@ -7,8 +7,7 @@ use stspp_matcher::{Image, Matcher, SAMPLES_PER_DN8, Sample};
 use super::score::central_plane_mm;
 use super::tables::AccuracyError;
 use super::{CanvasTruth, Capture};
-use crate::reconstruct::Options;
-use crate::reconstruct::RectifiedStack;
+use crate::reconstruct::{Options, RectifiedStack};
 use crate::rectify::{Kernel, Rectifier};
 
 /// A way to rectify, and the plane that comes of it.

@@ -131,7 +131,8 @@ impl Case {
         circles::find(frame, &self.capture.world, self.capture.centre_ns(0..frames))
     }
 
-    /// Matches the first `frames` pairs as `options` say and compares with the truth. Also gives the depth frame.
+    /// Matches the first `frames` pairs as `options` say and compares with the truth. Also gives the depth
+    /// frame.
     ///
     /// # Errors
     /// From the matcher.

@@ -50,7 +50,8 @@ impl<'a> Samples<'a> {
     }
 
     /// Compares left pixel (x, y) with the right images at x - `disparity_px`; `None` where the right
-    /// camera does not see that, or not all pixels that the interpolation takes. Between right pixels by Keys' cubic (1981).
+    /// camera does not see that, or not all pixels that the interpolation takes. Between right pixels by
+    /// Keys' cubic (1981).
     #[inline(always)]
     pub fn signature(&self, x: usize, y: usize, disparity_px: f32) -> Option<Signature> {
         let (width, frames) = (self.stack.width(), self.stack.frames());

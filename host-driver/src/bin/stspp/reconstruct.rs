@@ -48,7 +48,8 @@ pub struct Matching {
     /// Order of the subset's shape function.
     #[arg(long, value_enum, default_value_t)]
     pub order: OrderName,
-    /// Side of the square subset in pixels, odd, 5 to 17 (icgn: 15): larger ones have less noise and less detail.
+    /// Side of the square subset in pixels, odd, 5 to 17 (icgn: 15): larger ones have less noise and less
+    /// detail.
     #[arg(long, default_value_t = 9, value_name = "PX", value_parser = subset_px)]
     pub subset: usize,
     /// Least ZNCC of a point, -1 to 1: a higher one leaves fewer wrong points, and fewer right ones.
